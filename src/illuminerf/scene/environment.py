@@ -1,0 +1,182 @@
+"""Environment maps: linear radiance from every direction.
+
+Equirectangular, row 0 is straight up (+z). direction = (cos az cos el, sin az cos el, sin el), azimuth +pi at the left
+edge, 0 (the +x axis) in the middle, -pi at the right edge.
+"""
+
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+
+from illuminerf.scene.images import linear_from_srgb, read_png, read_rgb_exr, write_rgb_exr
+from illuminerf.workflow.errors import UserError
+
+_LDR_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True)
+class EnvironmentMap:
+    """Light from infinity.
+
+    Attributes:
+        linear_rgb: float32 [height, 2 * height, 3], linear rec.709 radiance, non-negative, unclipped.
+        name: a short name for tables and reports.
+    """
+
+    linear_rgb: np.ndarray
+    name: str = "light"
+
+    def __post_init__(self) -> None:
+        image, label = self.linear_rgb, f"the light '{self.name}'"
+        if image.ndim != 3 or image.shape[2] != 3 or image.shape[1] != 2 * image.shape[0] or image.size == 0:
+            raise UserError(
+                f"{label} is not an equirectangular map",
+                got=f"{image.shape[1]} x {image.shape[0]} pixels"
+                if image.ndim == 3
+                else f"shape {image.shape}",
+                wanted="width twice the height, 3 channels",
+                fix="crop or resample it to 2:1",
+            )
+        if not np.isfinite(image).all():
+            raise UserError(
+                f"{label} has {int((~np.isfinite(image)).sum())} NaN or infinite values",
+                wanted="finite radiance",
+                fix="replace them, for example by the neighbouring pixels",
+            )
+        if image.min() < 0:
+            raise UserError(
+                f"{label} has negative radiance",
+                got=f"{image.min():.3g}",
+                wanted="0 or more",
+                fix="clip it at 0",
+            )
+        if image.max() <= 0:
+            raise UserError(f"{label} is all black", fix="choose a light that emits something")
+
+    @staticmethod
+    def load(path: Path) -> "EnvironmentMap":
+        """Read an EXR or Radiance HDR map; PNG and JPEG are taken as sRGB with a warning, for they cannot hold the sun.
+
+        Raises:
+            UserError: missing, unreadable, not 2:1, or with values no light has.
+        """
+        path = Path(path)
+        suffix = path.suffix.lower()
+        if not path.is_file():
+            raise UserError(
+                f"the light {path} does not exist", wanted="an .exr or .hdr file", fix="check the path"
+            )
+        if suffix == ".exr":
+            image = read_rgb_exr(path)
+        elif suffix == ".hdr":
+            image = _read_hdr(path)
+        elif suffix in _LDR_SUFFIXES:
+            image = linear_from_srgb(read_png(path)[..., :3])
+            warnings.warn(
+                f"{path.name} is a low dynamic range image: lamps and the sun are cut off at 1, so shadows will be too soft "
+                "and highlights too dark. Prefer an .exr or .hdr map.",
+                stacklevel=2,
+            )
+        else:
+            raise UserError(
+                f"{path.name} is not a known kind of light",
+                got=suffix or "no suffix",
+                wanted=".exr, .hdr, .png or .jpg",
+            )
+        return EnvironmentMap(np.ascontiguousarray(image, np.float32), path.stem)
+
+    def save(self, path: Path) -> None:
+        """Write as single-precision linear EXR (the sun does not fit into a half)."""
+        write_rgb_exr(path, self.linear_rgb, half=False)
+
+    def rotated(self, radians: float) -> "EnvironmentMap":
+        """Turn the light about +z, counter-clockwise seen from above, with linear interpolation between columns."""
+        width = self.linear_rgb.shape[1]
+        shift = radians / (2 * np.pi) * width  # azimuth grows to the left: a turn by +phi moves columns left
+        whole = int(np.floor(shift))
+        part = np.float32(shift - whole)
+        left = np.roll(self.linear_rgb, -whole, axis=1)
+        if part < 1e-6:
+            return replace(self, linear_rgb=left)
+        return replace(self, linear_rgb=(1 - part) * left + part * np.roll(left, -1, axis=1))
+
+    def exposed(self, stops: float) -> "EnvironmentMap":
+        """Multiply the radiance by 2^stops."""
+        return replace(self, linear_rgb=(self.linear_rgb * np.float32(2.0**stops)).astype(np.float32))
+
+    def flipped(self) -> "EnvironmentMap":
+        """Mirror the light in the vertical plane y = 0 (azimuth changes sign)."""
+        return replace(self, linear_rgb=np.ascontiguousarray(self.linear_rgb[:, ::-1]))
+
+    def resized(self, height: int) -> "EnvironmentMap":
+        """Average over areas, so that small lamps keep their energy.
+
+        Raises:
+            UserError: the new height does not divide the old one.
+        """
+        old = self.linear_rgb.shape[0]
+        if height >= old:
+            return self
+        if old % height:
+            raise UserError("the light's height cannot be averaged down evenly", got=f"{old} to {height}")
+        factor = old // height
+        blocks = self.linear_rgb.reshape(height, factor, 2 * height, factor, 3)
+        return replace(self, linear_rgb=blocks.mean((1, 3), dtype=np.float64).astype(np.float32))
+
+    def directions(self) -> np.ndarray:
+        """Unit directions of the pixel centres, float32 [height, width, 3]."""
+        height, width = self.linear_rgb.shape[:2]
+        elevation = np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)
+        azimuth = np.pi - (np.arange(width) + 0.5) * (2 * np.pi / width)
+        el, az = np.meshgrid(elevation, azimuth, indexing="ij")
+        return np.stack([np.cos(az) * np.cos(el), np.sin(az) * np.cos(el), np.sin(el)], -1).astype(np.float32)
+
+    def solid_angles(self) -> np.ndarray:
+        """Steradians of each row's pixels, float64 [height, 1, 1]; they sum to 4 pi over the map."""
+        height, width = self.linear_rgb.shape[:2]
+        edges = np.sin(np.pi / 2 - np.arange(height + 1) * (np.pi / height))
+        return ((edges[:-1] - edges[1:]) * (2 * np.pi / width))[:, None, None]
+
+    def mean_radiance(self) -> np.ndarray:
+        """Average over the sphere, float64 [3]: what a white diffuse point that sees everything would show."""
+        return (self.linear_rgb * self.solid_angles()).sum((0, 1)) / (4 * np.pi)
+
+    def radiance(self, directions: np.ndarray) -> np.ndarray:
+        """Bilinear look-up, float32 [..., 3], of unit world directions [..., 3]."""
+        height, width = self.linear_rgb.shape[:2]
+        azimuth = np.arctan2(directions[..., 1], directions[..., 0])
+        elevation = np.arcsin(np.clip(directions[..., 2], -1, 1))
+        column = (np.pi - azimuth) * (width / (2 * np.pi)) - 0.5
+        row = np.clip((np.pi / 2 - elevation) * (height / np.pi) - 0.5, 0, height - 1)
+        left, top = np.floor(column).astype(int), np.floor(row).astype(int)
+        bottom = np.minimum(top + 1, height - 1)
+        u, v = (column - left)[..., None], (row - top)[..., None]
+        image = self.linear_rgb
+        left, right = left % width, (left + 1) % width
+        upper = (1 - u) * image[top, left] + u * image[top, right]
+        lower = (1 - u) * image[bottom, left] + u * image[bottom, right]
+        return ((1 - v) * upper + v * lower).astype(np.float32)
+
+
+def chrome_ball(light: EnvironmentMap, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """A mirror ball under `light` as seen from the +x axis: linear_rgb [size, size, 3] and alpha [size, size]."""
+    centres = (np.arange(size) + 0.5) / size * 2 - 1
+    up, right = np.meshgrid(-centres, centres, indexing="ij")
+    inside = right**2 + up**2 < 1
+    toward = np.sqrt(np.maximum(1 - right**2 - up**2, 0))
+    normal = np.stack([toward, right, up], -1)  # the camera looks along -x, so +y is to its right
+    reflected = 2 * normal[..., :1] * normal - np.array([1.0, 0.0, 0.0])
+    return light.radiance(reflected) * inside[..., None], inside.astype(np.float32)
+
+
+def _read_hdr(path: Path) -> np.ndarray:
+    try:
+        image = np.asarray(iio.imread(path, extension=".hdr"), np.float32)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise UserError(
+            f"{path} is not a readable HDR file", got=str(error).split("\n")[0], fix="export it again"
+        ) from error
+    return image[..., :3]

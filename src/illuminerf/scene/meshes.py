@@ -1,0 +1,86 @@
+"""Triangle meshes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from illuminerf.workflow.atomic import write_bytes
+from illuminerf.workflow.errors import UserError
+
+# glTF is y-up: (x, y, z) of our z-up world is written as (x, z, -y)
+_GLTF_FROM_WORLD = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """A mesh with one shading normal per vertex.
+
+    Attributes:
+        vertices: float32 [vertices, 3], world.
+        faces: int32 [faces, 3], counter-clockwise seen from outside.
+        vertex_normals: float32 [vertices, 3], unit.
+        vertex_colors: float32 [vertices, 3] sRGB in [0, 1], or None.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    vertex_normals: np.ndarray
+    vertex_colors: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.vertices) == 0 or len(self.faces) == 0:
+            raise UserError(
+                "the mesh is empty", got=f"{len(self.vertices)} vertices, {len(self.faces)} faces"
+            )
+        if not np.isfinite(self.vertices).all() or not np.isfinite(self.vertex_normals).all():
+            raise UserError("the mesh has NaN or infinite vertices or normals", fix="repair the mesh")
+        if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
+            raise UserError("the mesh has faces that name vertices it does not have")
+
+    def save_glb(self, path: Path) -> None:
+        """Write binary glTF 2.0, turned to its y-up axes, atomically. Normals (and colours) are kept as they are."""
+        mesh = trimesh.Trimesh(
+            self.vertices @ _GLTF_FROM_WORLD.T,
+            self.faces,
+            vertex_normals=self.vertex_normals @ _GLTF_FROM_WORLD.T,
+            process=False,
+        )
+        if self.vertex_colors is not None:
+            # glTF vertex colours are linear
+            from illuminerf.scene.images import linear_from_srgb, to_uint8
+
+            mesh.visual.vertex_colors = to_uint8(linear_from_srgb(self.vertex_colors))
+        write_bytes(path, trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=True))
+
+    @staticmethod
+    def load_glb(path: Path) -> "TriangleMesh":
+        """Read a binary glTF as one mesh, turned back to our z-up axes.
+
+        Raises:
+            UserError: missing, unreadable or empty.
+        """
+        if not Path(path).is_file():
+            raise UserError(f"{path} is missing", wanted="a .glb mesh")
+        try:
+            scene = trimesh.load_scene(str(path), file_type="glb", process=False)
+            mesh = scene.to_geometry()
+        except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+            raise UserError(
+                f"{path} is not a readable GLB mesh", got=str(error), fix="export it again"
+            ) from error
+        if not isinstance(mesh, trimesh.Trimesh):
+            raise UserError(f"{path} holds no triangles")
+        return TriangleMesh(
+            np.ascontiguousarray(np.asarray(mesh.vertices, np.float32) @ _GLTF_FROM_WORLD),
+            np.ascontiguousarray(mesh.faces, np.int32),
+            np.ascontiguousarray(np.asarray(mesh.vertex_normals, np.float32) @ _GLTF_FROM_WORLD),
+        )
+
+
+def sphere_mesh(subdivisions: int = 4, radius: float = 1.0) -> TriangleMesh:
+    """An icosphere about the origin with exact normals."""
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    vertices = np.asarray(sphere.vertices, np.float32)
+    return TriangleMesh(vertices, np.asarray(sphere.faces, np.int32), vertices / np.float32(radius))

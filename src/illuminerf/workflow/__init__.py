@@ -1,0 +1,1 @@
+"""How any stage runs: artefacts and their fingerprints, configs as JSON, checkpoints, progress, errors."""

@@ -1,0 +1,244 @@
+"""Artefact folders: what a stage made, from what, and whether it is finished.
+
+A folder holds the stage's typed files and
+    config.json      the stage and its config
+    inputs.json      the fingerprints of what it was made from
+    provenance.json  versions, device, seconds, peak memory
+    DONE             the artefact's own fingerprint; written last, by an atomic rename
+Same key and DONE: load. Same key, unfinished: resume. Another key: refuse and say which field differs.
+"""
+
+import hashlib
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from illuminerf.workflow.atomic import read_json, remove_partial_files, write_bytes, write_json
+from illuminerf.workflow.config import first_difference, to_json
+from illuminerf.workflow.errors import UserError
+
+SCHEMA = 1
+_OWN_FILES = ("config.json", "inputs.json", "provenance.json", "DONE", ".lock")
+_VERSIONED = ("illuminerf", "torch", "numpy", "mitsuba", "diffusers", "numba", "trimesh")
+
+
+@dataclass
+class Artefact:
+    """One artefact folder while a stage works on it."""
+
+    path: Path
+    stage: str
+    is_done: bool
+    finished: bool = False
+    metrics: dict[str, Any] = field(default_factory=dict)
+
+    def finish(self, metrics: dict[str, Any] | None = None) -> None:
+        """Say that every file is in place; the folder is sealed when the `with` block ends without an error."""
+        self.finished = True
+        self.metrics = metrics or {}
+
+
+@contextmanager
+def open_artefact(out: Path, stage: str, config: Any, inputs: dict[str, Path | str]) -> Iterator[Artefact]:
+    """Open `out` for `stage`: to load (`is_done`), to go on, or to start.
+
+    Args:
+        out: the artefact's folder; made where absent.
+        stage: the stage's name, for example "estimate_geometry".
+        config: the stage's frozen dataclass.
+        inputs: by role, the paths this artefact is made from (artefact folders or files), or literal strings.
+
+    Raises:
+        UserError: the folder was made by another stage, config or input, or another process is working on it.
+    """
+    out = Path(out)
+    key = {"schema": SCHEMA, "stage": stage, "config": to_json(config)}
+    made_from = {role: fingerprint(source) for role, source in sorted(inputs.items())}
+    is_done = _check_key(out, key, made_from)
+    if is_done:
+        yield Artefact(out, stage, is_done=True, finished=True)
+        return
+    with _locked(out):
+        remove_partial_files(out)
+        write_json(out / "config.json", key)
+        write_json(out / "inputs.json", made_from)
+        artefact = Artefact(out, stage, is_done=False)
+        start = time.monotonic()
+        yield artefact
+        if artefact.finished:
+            _seal(artefact, seconds=time.monotonic() - start)
+
+
+def fingerprint(source: Path | str) -> str:
+    """A sha256 that names the content of an input: an artefact's own, a file's, a folder's, or a literal string's.
+
+    Raises:
+        UserError: the path is missing, or an artefact folder is unfinished or corrupt.
+    """
+    if isinstance(source, str):
+        return hashlib.sha256(source.encode()).hexdigest()
+    if (source / "config.json").exists() and (source / "inputs.json").exists():
+        if not (source / "DONE").exists():
+            raise UserError(
+                f"{source} is unfinished",
+                fix="run the stage that makes it again; it goes on where it stopped",
+            )
+        return (source / "DONE").read_text().strip()
+    if source.is_dir():
+        return _folder_digest(source, exclude=())
+    if source.is_file():
+        return _file_digest(source)
+    raise UserError(f"{source} does not exist", fix="check the path")
+
+
+def verify(out: Path) -> None:
+    """Recompute an artefact's fingerprint from its files.
+
+    Raises:
+        UserError: a file was changed, truncated or removed since the stage finished.
+    """
+    recorded = fingerprint(out)
+    if _artefact_digest(out) != recorded:
+        raise UserError(
+            f"{out} is corrupt: its files are not those its stage wrote",
+            fix=f"delete {out} and run the same command again",
+        )
+
+
+def _check_key(out: Path, key: dict[str, Any], made_from: dict[str, str]) -> bool:
+    if out.exists() and not out.is_dir():
+        raise UserError(f"{out} is a file", wanted="a folder", fix="choose another --out")
+    config_file, inputs_file = out / "config.json", out / "inputs.json"
+    if not config_file.exists():
+        strangers = (
+            [entry.name for entry in out.iterdir() if entry.name not in _OWN_FILES] if out.exists() else []
+        )
+        if strangers:
+            raise UserError(
+                f"{out} holds files that are not a run of this program",
+                got=sorted(strangers)[0],
+                fix="choose an empty or a new folder with --out",
+            )
+        return False
+    difference = first_difference(read_json(config_file), key)
+    if difference is None and inputs_file.exists():
+        old_inputs = read_json(inputs_file)
+        changed = next((role for role in made_from if old_inputs.get(role) != made_from[role]), None)
+        difference = f"its input '{changed}' has changed" if changed else None
+    if difference:
+        raise UserError(
+            f"{out} was made with other settings: {difference}",
+            fix="choose another --out, delete that folder, or use the settings it was made with",
+        )
+    if not (out / "DONE").exists():
+        return False
+    verify(out)
+    return True
+
+
+def _seal(artefact: Artefact, seconds: float) -> None:
+    provenance_file = artefact.path / "provenance.json"
+    write_json(
+        provenance_file,
+        {
+            "versions": {name: _version(name) for name in _VERSIONED},
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            "commit": _commit(),
+            "seconds": round(seconds, 3),
+            "peak_memory_gb": round(peak_memory_gb(), 3),
+            "metrics": artefact.metrics,
+        },
+    )
+    write_bytes(artefact.path / "DONE", (_artefact_digest(artefact.path) + "\n").encode())
+
+
+def read_metrics(out: Path) -> dict[str, Any]:
+    """What the stage measured: its metrics with `seconds` and `peak_memory_gb` of the process that finished it."""
+    provenance = read_json(out / "provenance.json")
+    return {
+        **provenance["metrics"],
+        "seconds": provenance["seconds"],
+        "peak_memory_gb": provenance["peak_memory_gb"],
+    }
+
+
+def peak_memory_gb() -> float:
+    """Largest resident size of this process so far, in GB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e9 if sys.platform == "darwin" else 1e6)
+
+
+def _artefact_digest(out: Path) -> str:
+    # provenance differs between two runs that made the same thing, so it stays out of the fingerprint
+    return _folder_digest(out, exclude=("provenance.json", "DONE", ".lock"))
+
+
+def _folder_digest(folder: Path, exclude: tuple[str, ...]) -> str:
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_file() and name not in exclude:
+            digest.update(f"{name}\0{_file_digest(path)}\n".encode())
+    return digest.hexdigest()
+
+
+def _file_digest(path: Path) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+@contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """Keep two processes from working on one artefact; the kernel drops the lock when a process dies."""
+    import fcntl
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        handle = os.open(out / ".lock", os.O_CREAT | os.O_RDWR, 0o644)
+    except OSError as error:
+        raise UserError(
+            f"{out} cannot be written", got=str(error.strerror), fix="choose another --out"
+        ) from error
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UserError(
+                f"another process is working on {out}", fix="wait for it or choose another --out"
+            ) from error
+        yield
+    finally:
+        os.close(handle)
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "absent"
+
+
+def _commit() -> str:
+    """The commit of the source tree this package runs from, or "release" where it is installed from a wheel."""
+    try:
+        done = subprocess.run(
+            ["git", "rev-parse", "HEAD"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            timeout=5,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return "release"
+    return done.stdout.strip()

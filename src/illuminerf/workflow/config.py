@@ -1,0 +1,93 @@
+"""Frozen dataclasses to JSON and back, strictly: unknown, missing and mistyped fields are errors."""
+
+import dataclasses
+import types
+import typing
+from pathlib import Path
+from typing import Any, TypeVar, Union
+
+from illuminerf.workflow.errors import UserError
+
+ConfigType = TypeVar("ConfigType")
+
+
+def to_json(config: Any) -> Any:
+    """Turn a (nested) frozen dataclass into plain JSON types."""
+    if dataclasses.is_dataclass(config) and not isinstance(config, type):
+        return {field.name: to_json(getattr(config, field.name)) for field in dataclasses.fields(config)}
+    if isinstance(config, (tuple, list)):
+        return [to_json(item) for item in config]
+    if isinstance(config, dict):
+        return {str(key): to_json(value) for key, value in config.items()}
+    if isinstance(config, Path):
+        return str(config)
+    return config
+
+
+def from_json(cls: type[ConfigType], content: dict[str, Any]) -> ConfigType:
+    """Build the dataclass `cls` from what `to_json` made of it.
+
+    Raises:
+        UserError: a field is unknown, missing, or of the wrong type.
+    """
+    if not isinstance(content, dict):
+        raise UserError(f"{cls.__name__} must be a JSON object", got=type(content).__name__)
+    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    unknown = sorted(set(content) - set(fields))
+    if unknown:
+        raise UserError(f"{cls.__name__} has no field '{unknown[0]}'", wanted=", ".join(fields))
+    hints = typing.get_type_hints(cls)
+    for name, field in fields.items():
+        has_default = not (
+            field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        )
+        if name not in content and not has_default:
+            raise UserError(f"{cls.__name__} lacks the field '{name}'")
+    return cls(
+        **{name: _coerced(f"{cls.__name__}.{name}", hints[name], value) for name, value in content.items()}
+    )
+
+
+def _coerced(name: str, hint: Any, value: Any) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        return _coerced(name, next(argument for argument in arguments if argument is not type(None)), value)
+    if dataclasses.is_dataclass(hint):
+        return from_json(hint, value)  # type: ignore[arg-type]
+    if origin is tuple:
+        if not isinstance(value, list):
+            raise UserError(f"{name} must be a list", got=type(value).__name__)
+        variadic = len(arguments) == 2 and arguments[1] is Ellipsis
+        items = [arguments[0]] * len(value) if variadic else list(arguments)
+        if len(items) != len(value):
+            raise UserError(f"{name} has {len(value)} entries", wanted=str(len(items)))
+        return tuple(_coerced(name, item, entry) for item, entry in zip(items, value, strict=True))
+    if origin is typing.Literal:
+        if value not in arguments:
+            raise UserError(
+                f"{name} is not a known choice", got=repr(value), wanted=", ".join(map(str, arguments))
+            )
+        return value
+    if hint is Path:
+        return Path(value)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if hint in (int, float, str, bool) and type(value) is not hint:
+        raise UserError(f"{name} has the wrong type", got=type(value).__name__, wanted=hint.__name__)
+    return value
+
+
+def first_difference(old: Any, new: Any, name: str = "") -> str | None:
+    """Name the first field in which two JSON values differ, with both values, or None where they agree."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted(set(old) | set(new)):
+            path = f"{name}.{key}" if name else key
+            if key not in old or key not in new:
+                return f"{path} is {'absent' if key not in old else old[key]!r} there and {new.get(key, 'absent')!r} here"
+            difference = first_difference(old[key], new[key], path)
+            if difference:
+                return difference
+        return None
+    return None if old == new else f"{name} is {old!r} there and {new!r} here"

@@ -1,0 +1,82 @@
+"""Progress with time left: a bar on a terminal, one line now and then in a log."""
+
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sized
+from contextlib import contextmanager
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+Item = TypeVar("Item")
+_LOG_EVERY_SECONDS = 15.0
+console = Console(stderr=True, soft_wrap=True)
+
+
+class StepProgress:
+    """Counts steps of one named piece of work."""
+
+    def __init__(self, description: str, total: int, completed: int = 0) -> None:
+        self.description, self.total, self.completed = description, total, completed
+        self._start, self._first = time.monotonic(), completed
+        self._last_line = self._start
+        self._bar: Progress | None = None
+        if console.is_terminal and console.width >= 40:
+            narrow = console.width < 100
+            columns = [
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=10 if narrow else 30),
+                MofNCompleteColumn(),
+            ]
+            columns += [TimeRemainingColumn()] if narrow else [TimeElapsedColumn(), TimeRemainingColumn()]
+            self._bar = Progress(*columns, TextColumn("{task.fields[note]}"), console=console)
+            self._task = self._bar.add_task(description, total=total, completed=completed, note="")
+
+    def advance(self, steps: int = 1, **numbers: float) -> None:
+        """Count `steps` more; `numbers` are shown beside the bar, e.g. psnr=27.1."""
+        self.completed += steps
+        note = " ".join(f"{name} {value:.4g}" for name, value in numbers.items())
+        if self._bar is not None:
+            self._bar.update(self._task, completed=self.completed, note=note)
+            return
+        now = time.monotonic()
+        if now - self._last_line >= _LOG_EVERY_SECONDS or self.completed == self.total:
+            self._last_line = now
+            rate = (self.completed - self._first) / max(now - self._start, 1e-9)
+            left = (self.total - self.completed) / rate if rate > 0 else float("nan")
+            line = f"{self.description}: {self.completed}/{self.total}, {left:.0f} s left {note}".rstrip()
+            print(line, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def step_progress(description: str, total: int, completed: int = 0) -> Iterator[StepProgress]:
+    """Show progress over `total` steps, of which `completed` were done by an earlier run."""
+    progress = StepProgress(description, total, completed)
+    if progress._bar is None:
+        yield progress
+        return
+    with progress._bar:
+        yield progress
+
+
+def track(iterable: Iterable[Item], description: str, total: int | None = None) -> Iterator[Item]:
+    """Iterate with progress."""
+    if total is None:
+        total = len(iterable) if isinstance(iterable, Sized) else 0
+    with step_progress(description, total) as progress:
+        for item in iterable:
+            yield item
+            progress.advance()
+
+
+def say(message: str) -> None:
+    """Tell the person at the terminal something, above any bar."""
+    console.print(message, highlight=False)
