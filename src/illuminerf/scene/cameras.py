@@ -1,7 +1,7 @@
 """Pinhole cameras.
 
-OpenGL axes (x right, y up, looking along -z) in a z-up world; `world_from_camera` is 4x4 and rigid. Pixel (column
-i, row j) has its centre at (i + 0.5, j + 0.5), rows run downward.
+OpenGL axes (x right, y up, looking along -z) in a z-up world; `world_from_camera` is 4x4 and rigid.
+Pixel (column i, row j) has its centre at (i + 0.5, j + 0.5), rows run downward.
 """
 
 from dataclasses import dataclass
@@ -87,7 +87,7 @@ class Cameras:
     def rays(
         self, view_index: Int[Tensor, " rays"], pixels_xy: Float[Tensor, "rays 2"]
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
-        """Origins and unit directions in the world of the rays through image points, on the device of the index."""
+        """World origins and unit directions of the rays through image points, on the device of the index."""
         device = view_index.device
         poses = torch.from_numpy(self.world_from_camera).to(device)[view_index]
         fx, fy, cx, cy = torch.from_numpy(self.intrinsics).to(device)[view_index].unbind(-1)
@@ -108,7 +108,7 @@ class Cameras:
         return origins.reshape(shape), directions.reshape(shape)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Image points [views, points, 2] and depths along the optical axis [views, points] of world points [points, 3]."""
+        """Image points [views, points, 2] and depths along the axis [views, points] of points [points, 3]."""
         camera_from_world = np.linalg.inv(self.world_from_camera)
         in_camera = (
             np.einsum("vij,pj->vpi", camera_from_world[:, :3, :3], points) + camera_from_world[:, None, :3, 3]
@@ -153,7 +153,7 @@ class Cameras:
             raise UserError(
                 "cameras are not in the expected form",
                 got=f"{type(error).__name__}: {error}",
-                wanted="height, width and frames with world_from_camera (4x4) and intrinsics {fx, fy, cx, cy}",
+                wanted="height, width, frames with world_from_camera (4x4) and intrinsics {fx, fy, cx, cy}",
             ) from error
 
 

@@ -1,7 +1,7 @@
 """Environment maps: linear radiance from every direction.
 
-Equirectangular, row 0 is straight up (+z). direction = (cos az cos el, sin az cos el, sin el), azimuth +pi at the left
-edge, 0 (the +x axis) in the middle, -pi at the right edge.
+Equirectangular, row 0 is straight up (+z). direction = (cos az cos el, sin az cos el, sin el), azimuth +pi
+at the left edge, 0 (the +x axis) in the middle, -pi at the right edge.
 """
 
 import warnings
@@ -14,6 +14,7 @@ import numpy as np
 from illuminerf.scene.images import linear_from_srgb, read_png, read_rgb_exr, write_rgb_exr
 from illuminerf.workflow.errors import UserError
 
+_UNDERSHOOT = 0.05  # of the mean radiance
 _LDR_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -58,7 +59,7 @@ class EnvironmentMap:
 
     @staticmethod
     def load(path: Path) -> "EnvironmentMap":
-        """Read an EXR or Radiance HDR map; PNG and JPEG are taken as sRGB with a warning, for they cannot hold the sun.
+        """Read an EXR or Radiance HDR map; PNG and JPEG are taken as sRGB, with a warning.
 
         Raises:
             UserError: missing, unreadable, not 2:1, or with values no light has.
@@ -76,8 +77,8 @@ class EnvironmentMap:
         elif suffix in _LDR_SUFFIXES:
             image = linear_from_srgb(read_png(path)[..., :3])
             warnings.warn(
-                f"{path.name} is a low dynamic range image: lamps and the sun are cut off at 1, so shadows will be too soft "
-                "and highlights too dark. Prefer an .exr or .hdr map.",
+                f"{path.name} is a low dynamic range image: lamps and the sun are cut off at 1, so shadows will be "
+                "too soft and highlights too dark. Prefer an .exr or .hdr map.",
                 stacklevel=2,
             )
         else:
@@ -86,6 +87,9 @@ class EnvironmentMap:
                 got=suffix or "no suffix",
                 wanted=".exr, .hdr, .png or .jpg",
             )
+        # resampling filters undershoot beside lamps: a dip that small is rounding, a larger one is a broken file
+        if np.isfinite(image).all() and -_UNDERSHOOT * image.mean() < image.min() < 0:
+            image = np.maximum(image, 0)
         return EnvironmentMap(np.ascontiguousarray(image, np.float32), path.stem)
 
     def save(self, path: Path) -> None:
@@ -93,7 +97,7 @@ class EnvironmentMap:
         write_rgb_exr(path, self.linear_rgb, half=False)
 
     def rotated(self, radians: float) -> "EnvironmentMap":
-        """Turn the light about +z, counter-clockwise seen from above, with linear interpolation between columns."""
+        """Turn the light about +z, counter-clockwise seen from above, interpolating between columns."""
         width = self.linear_rgb.shape[1]
         shift = radians / (2 * np.pi) * width  # azimuth grows to the left: a turn by +phi moves columns left
         whole = int(np.floor(shift))
@@ -141,7 +145,7 @@ class EnvironmentMap:
         return ((edges[:-1] - edges[1:]) * (2 * np.pi / width))[:, None, None]
 
     def mean_radiance(self) -> np.ndarray:
-        """Average over the sphere, float64 [3]: what a white diffuse point that sees everything would show."""
+        """Average over the sphere, float64 [3]: the look of a white diffuse point that sees everything."""
         return (self.linear_rgb * self.solid_angles()).sum((0, 1)) / (4 * np.pi)
 
     def radiance(self, directions: np.ndarray) -> np.ndarray:
@@ -162,7 +166,7 @@ class EnvironmentMap:
 
 
 def chrome_ball(light: EnvironmentMap, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """A mirror ball under `light` as seen from the +x axis: linear_rgb [size, size, 3] and alpha [size, size]."""
+    """A mirror ball under `light` seen from +x: linear_rgb [size, size, 3] and alpha [size, size]."""
     centres = (np.arange(size) + 0.5) / size * 2 - 1
     up, right = np.meshgrid(-centres, centres, indexing="ij")
     inside = right**2 + up**2 < 1

@@ -1,4 +1,4 @@
-"""Images: sRGB coding, compositing, PNG and EXR files. Arrays are [..., height, width, channels] unless said otherwise."""
+"""Images: sRGB coding, compositing, PNG and EXR files. Arrays are [..., height, width, channels]."""
 
 from pathlib import Path
 from typing import TypeVar
@@ -16,7 +16,7 @@ Array = TypeVar("Array", np.ndarray, Tensor)
 
 
 def srgb_from_linear(linear_rgb: Array) -> Array:
-    """sRGB coding (IEC 61966-2-1) of linear values; the power law goes on above 1 and nothing is clipped there."""
+    """sRGB coding (IEC 61966-2-1) of linear values; the power law goes on above 1, unclipped."""
     if isinstance(linear_rgb, Tensor):
         value = linear_rgb.clamp_min(0.0)
         return torch.where(
@@ -106,7 +106,7 @@ def write_exr(path: Path, channels: dict[str, np.ndarray], half: bool = True) ->
 
 
 def read_rgb_exr(path: Path) -> np.ndarray:
-    """Read the R, G, B channels of an EXR as float32 [height, width, 3]; a single luminance channel is repeated."""
+    """Read R, G, B of an EXR as float32 [height, width, 3]; a single luminance channel is repeated."""
     channels = read_exr(path)
     if "Y" in channels and "R" not in channels:
         return np.repeat(channels["Y"][..., None], 3, -1)

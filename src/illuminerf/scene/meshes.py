@@ -40,7 +40,7 @@ class TriangleMesh:
             raise UserError("the mesh has faces that name vertices it does not have")
 
     def save_glb(self, path: Path) -> None:
-        """Write binary glTF 2.0, turned to its y-up axes, atomically. Normals (and colours) are kept as they are."""
+        """Write binary glTF 2.0, turned to its y-up axes, atomically, with normals (and colours) as they are."""
         mesh = trimesh.Trimesh(
             self.vertices @ _GLTF_FROM_WORLD.T,
             self.faces,
@@ -65,18 +65,37 @@ class TriangleMesh:
             raise UserError(f"{path} is missing", wanted="a .glb mesh")
         try:
             scene = trimesh.load_scene(str(path), file_type="glb", process=False)
-            mesh = scene.to_geometry()
+            parts = [_placed(scene, node) for node in scene.graph.nodes_geometry]
         except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
             raise UserError(
                 f"{path} is not a readable GLB mesh", got=str(error), fix="export it again"
             ) from error
-        if not isinstance(mesh, trimesh.Trimesh):
+        parts = [part for part in parts if part is not None]
+        if not parts:
             raise UserError(f"{path} holds no triangles")
+        firsts = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts[:-1]])
         return TriangleMesh(
-            np.ascontiguousarray(np.asarray(mesh.vertices, np.float32) @ _GLTF_FROM_WORLD),
-            np.ascontiguousarray(mesh.faces, np.int32),
-            np.ascontiguousarray(np.asarray(mesh.vertex_normals, np.float32) @ _GLTF_FROM_WORLD),
+            np.concatenate([vertices for vertices, _, _ in parts]),
+            np.concatenate(
+                [faces + first for (_, faces, _), first in zip(parts, firsts, strict=True)]
+            ).astype(np.int32),
+            np.concatenate([normals for _, _, normals in parts]),
         )
+
+
+def _placed(scene: trimesh.Scene, node: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Vertices, faces and normals of one node in our world, or None where it has no triangles."""
+    transform, name = scene.graph[node]
+    mesh = scene.geometry[name]
+    if not isinstance(mesh, trimesh.Trimesh):
+        return None
+    normal_transform = np.linalg.inv(transform[:3, :3]).T
+    vertices = mesh.vertices @ transform[:3, :3].T + transform[:3, 3]
+    normals = mesh.vertex_normals @ normal_transform.T
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    turned = (np.ascontiguousarray(array @ _GLTF_FROM_WORLD, np.float32) for array in (vertices, normals))
+    vertices, normals = turned
+    return vertices, np.asarray(mesh.faces, np.int64), normals
 
 
 def sphere_mesh(subdivisions: int = 4, radius: float = 1.0) -> TriangleMesh:

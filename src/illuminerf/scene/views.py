@@ -14,7 +14,7 @@ class Views:
 
     Attributes:
         cameras: one per image.
-        srgb: float32 [views, height, width, 3], straight (not premultiplied) sRGB in [0, 1]; 0 where alpha is 0.
+        srgb: float32 [views, height, width, 3], straight sRGB in [0, 1]; 0 where alpha is 0.
         alpha: float32 [views, height, width] coverage in [0, 1].
     """
 

@@ -42,7 +42,7 @@ class Artefact:
     metrics: dict[str, Any] = field(default_factory=dict)
 
     def finish(self, metrics: dict[str, Any] | None = None) -> None:
-        """Say that every file is in place; the folder is sealed when the `with` block ends without an error."""
+        """Say that every file is in place; the folder is sealed when the `with` block ends well."""
         self.finished = True
         self.metrics = metrics or {}
 
@@ -79,7 +79,7 @@ def open_artefact(out: Path, stage: str, config: Any, inputs: dict[str, Path | s
 
 
 def fingerprint(source: Path | str) -> str:
-    """A sha256 that names the content of an input: an artefact's own, a file's, a folder's, or a literal string's.
+    """A sha256 that names an input's content: an artefact's own, a file's, a folder's, or a string's.
 
     Raises:
         UserError: the path is missing, or an artefact folder is unfinished or corrupt.
@@ -163,7 +163,7 @@ def _seal(artefact: Artefact, seconds: float) -> None:
 
 
 def read_metrics(out: Path) -> dict[str, Any]:
-    """What the stage measured: its metrics with `seconds` and `peak_memory_gb` of the process that finished it."""
+    """What the stage measured, with `seconds` and `peak_memory_gb` of the process that finished it."""
     provenance = read_json(out / "provenance.json")
     return {
         **provenance["metrics"],
@@ -229,7 +229,7 @@ def _version(name: str) -> str:
 
 
 def _commit() -> str:
-    """The commit of the source tree this package runs from, or "release" where it is installed from a wheel."""
+    """The commit of the source tree this runs from, or "release" where it is installed from a wheel."""
     try:
         done = subprocess.run(
             ["git", "rev-parse", "HEAD"],

@@ -14,7 +14,7 @@ from illuminerf.workflow.errors import UserError
 
 
 def save_checkpoint(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
-    """Write `tensors` and JSON-able `metadata` to one safetensors file; a kill leaves the old file or the new one."""
+    """Write `tensors` and JSON-able `metadata` to one safetensors file, whole or not at all."""
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     write_bytes(path, save(contiguous, metadata={"illuminerf": json.dumps(metadata, sort_keys=True)}))
 

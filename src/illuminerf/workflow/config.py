@@ -85,7 +85,7 @@ def first_difference(old: Any, new: Any, name: str = "") -> str | None:
         for key in sorted(set(old) | set(new)):
             path = f"{name}.{key}" if name else key
             if key not in old or key not in new:
-                return f"{path} is {'absent' if key not in old else old[key]!r} there and {new.get(key, 'absent')!r} here"
+                return f"{path} is {old.get(key, 'absent')!r} there and {new.get(key, 'absent')!r} here"
             difference = first_difference(old[key], new[key], path)
             if difference:
                 return difference
