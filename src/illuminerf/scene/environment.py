@@ -77,8 +77,8 @@ class EnvironmentMap:
         elif suffix in _LDR_SUFFIXES:
             image = linear_from_srgb(read_png(path)[..., :3])
             warnings.warn(
-                f"{path.name} is a low dynamic range image: lamps and the sun are cut off at 1, so shadows will be "
-                "too soft and highlights too dark. Prefer an .exr or .hdr map.",
+                f"{path.name} is a low dynamic range image: lamps and the sun are cut off at 1, so shadows "
+                "will be too soft and highlights too dark. Prefer an .exr or .hdr map.",
                 stacklevel=2,
             )
         else:
@@ -87,7 +87,7 @@ class EnvironmentMap:
                 got=suffix or "no suffix",
                 wanted=".exr, .hdr, .png or .jpg",
             )
-        # resampling filters undershoot beside lamps: a dip that small is rounding, a larger one is a broken file
+        # resampling filters undershoot beside lamps: a small dip is rounding, a larger one a broken file
         if np.isfinite(image).all() and -_UNDERSHOOT * image.mean() < image.min() < 0:
             image = np.maximum(image, 0)
         return EnvironmentMap(np.ascontiguousarray(image, np.float32), path.stem)

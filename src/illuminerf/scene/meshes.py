@@ -40,7 +40,7 @@ class TriangleMesh:
             raise UserError("the mesh has faces that name vertices it does not have")
 
     def save_glb(self, path: Path) -> None:
-        """Write binary glTF 2.0, turned to its y-up axes, atomically, with normals (and colours) as they are."""
+        """Write binary glTF 2.0, turned to its y-up axes, atomically; normals and colours are kept."""
         mesh = trimesh.Trimesh(
             self.vertices @ _GLTF_FROM_WORLD.T,
             self.faces,
