@@ -8,10 +8,10 @@ import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 
 from illuminerf.scene.images import linear_from_srgb, read_png, read_rgb_exr, write_rgb_exr
+from illuminerf.scene.radiance_hdr import read_hdr
 from illuminerf.workflow.errors import UserError
 
 _UNDERSHOOT = 0.05  # of the mean radiance
@@ -73,7 +73,7 @@ class EnvironmentMap:
         if suffix == ".exr":
             image = read_rgb_exr(path)
         elif suffix == ".hdr":
-            image = _read_hdr(path)
+            image = read_hdr(path)
         elif suffix in _LDR_SUFFIXES:
             image = linear_from_srgb(read_png(path)[..., :3])
             warnings.warn(
@@ -174,13 +174,3 @@ def chrome_ball(light: EnvironmentMap, size: int) -> tuple[np.ndarray, np.ndarra
     normal = np.stack([toward, right, up], -1)  # the camera looks along -x, so +y is to its right
     reflected = 2 * normal[..., :1] * normal - np.array([1.0, 0.0, 0.0])
     return light.radiance(reflected) * inside[..., None], inside.astype(np.float32)
-
-
-def _read_hdr(path: Path) -> np.ndarray:
-    try:
-        image = np.asarray(iio.imread(path, extension=".hdr"), np.float32)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise UserError(
-            f"{path} is not a readable HDR file", got=str(error).split("\n")[0], fix="export it again"
-        ) from error
-    return image[..., :3]

@@ -1,0 +1,33 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from illuminerf.scene.meshes import TriangleMesh, sphere_mesh
+from illuminerf.workflow.errors import UserError
+
+
+def test_glb_round_trip_is_exact_and_stands_upright(tmp_path: Path) -> None:
+    sphere = sphere_mesh(2)
+    stretched = TriangleMesh(sphere.vertices * np.float32([1, 2, 3]), sphere.faces, sphere.vertex_normals)
+    stretched.save_glb(tmp_path / "mesh.glb")
+    again = TriangleMesh.load_glb(tmp_path / "mesh.glb")
+    np.testing.assert_array_equal(again.vertices, stretched.vertices)
+    np.testing.assert_array_equal(again.vertex_normals, stretched.vertex_normals)
+    np.testing.assert_array_equal(again.faces, stretched.faces)
+    import trimesh
+
+    raw = trimesh.load_scene(str(tmp_path / "mesh.glb"))
+    assert raw.extents[1] == pytest.approx(6, rel=1e-2), "glTF is y-up: our z must be its y"
+
+
+def test_broken_meshes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="empty"):
+        TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)))
+    with pytest.raises(UserError, match="NaN"):
+        TriangleMesh(np.full((3, 3), np.nan), np.array([[0, 1, 2]]), np.zeros((3, 3)))
+    with pytest.raises(UserError, match="vertices it does not have"):
+        TriangleMesh(np.zeros((3, 3)), np.array([[0, 1, 3]]), np.zeros((3, 3)))
+    (tmp_path / "mesh.glb").write_bytes(b"glTF but not really")
+    with pytest.raises(UserError, match="not a readable GLB"):
+        TriangleMesh.load_glb(tmp_path / "mesh.glb")
