@@ -31,7 +31,7 @@ def run_length_file(rgbe: np.ndarray) -> bytes:
                 part = channel[start : start + 4]
                 same = (part == part[0]).all()
                 body += bytes([128 + len(part), part[0]]) if same else bytes([len(part)]) + part.tobytes()
-    return b"#?RADIANCE\n\n" + f"-Y {height} +X {width}\n".encode() + body
+    return b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n" + f"-Y {height} +X {width}\n".encode() + body
 
 
 def picture() -> np.ndarray:

@@ -1,0 +1,1 @@
+"""Readers of captures and benchmarks: any supported folder in, one `Capture` out."""

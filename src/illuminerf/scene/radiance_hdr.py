@@ -11,7 +11,7 @@ _MAX_PIXELS = 2**28
 
 
 def read_hdr(path: Path) -> np.ndarray:
-    """Read a Radiance picture in the standard orientation (-Y height +X width): linear_rgb float32 [height, width, 3].
+    """Read a Radiance picture in the standard orientation (-Y +X): linear_rgb float32 [height, width, 3].
 
     Raises:
         UserError: not a Radiance picture, truncated, or in another orientation.
