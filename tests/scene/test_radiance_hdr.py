@@ -58,7 +58,8 @@ def test_agrees_with_an_independent_reader(tmp_path: Path) -> None:
     theirs = np.array(
         mitsuba.Bitmap(str(tmp_path / "a.hdr")).convert(component_format=mitsuba.Struct.Type.Float32)
     )
-    np.testing.assert_allclose(read_hdr(tmp_path / "a.hdr"), theirs, rtol=8e-3, atol=1e-6)
+    # theirs takes the lower end of each quantisation step, ours its middle
+    assert (np.abs(read_hdr(tmp_path / "a.hdr") - theirs) <= theirs.max(-1, keepdims=True) / 200).all()
 
 
 @pytest.mark.parametrize("keep", [10, 60, 100])
