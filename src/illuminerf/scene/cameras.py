@@ -56,9 +56,7 @@ class Cameras:
                 fix="remove any scale or mirroring from the poses",
             )
         if len(intrinsics) and intrinsics[:, :2].min() <= 0:
-            raise UserError(
-                "a camera has no positive focal length", got=f"{intrinsics[:, :2].min():.3g} pixels"
-            )
+            raise UserError("a camera has no positive focal length", got=f"{intrinsics[:, :2].min():.3g} pixels")
 
     def __len__(self) -> int:
         return len(self.world_from_camera)
@@ -97,9 +95,7 @@ class Cameras:
         directions = directions / directions.norm(dim=-1, keepdim=True)
         return poses[:, :3, 3].float(), directions.float()
 
-    def image_rays(
-        self, view: int
-    ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
+    def image_rays(self, view: int) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
         """Origins and unit directions of all pixel centres of one view."""
         pixels_xy = pixel_centres(self.height, self.width).reshape(-1, 2)
         index = torch.full((len(pixels_xy),), view, dtype=torch.long)
@@ -110,9 +106,7 @@ class Cameras:
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Image points [views, points, 2] and depths along the axis [views, points] of points [points, 3]."""
         camera_from_world = np.linalg.inv(self.world_from_camera)
-        in_camera = (
-            np.einsum("vij,pj->vpi", camera_from_world[:, :3, :3], points) + camera_from_world[:, None, :3, 3]
-        )
+        in_camera = np.einsum("vij,pj->vpi", camera_from_world[:, :3, :3], points) + camera_from_world[:, None, :3, 3]
         depth = -in_camera[..., 2]
         safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
         fx, fy, cx, cy = (self.intrinsics[:, None, i] for i in range(4))
@@ -141,14 +135,10 @@ class Cameras:
         """
         try:
             frames = content["frames"]
-            poses = np.array([frame["world_from_camera"] for frame in frames], np.float64).reshape(
-                len(frames), 4, 4
-            )
+            poses = np.array([frame["world_from_camera"] for frame in frames], np.float64).reshape(len(frames), 4, 4)
             names = ("fx", "fy", "cx", "cy")
             intrinsics = np.array([[frame["intrinsics"][n] for n in names] for frame in frames], np.float64)
-            return Cameras(
-                poses, intrinsics.reshape(len(frames), 4), int(content["height"]), int(content["width"])
-            )
+            return Cameras(poses, intrinsics.reshape(len(frames), 4), int(content["height"]), int(content["width"]))
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(
                 "cameras are not in the expected form",
@@ -163,9 +153,7 @@ def pixel_centres(height: int, width: int) -> Float[Tensor, "height width 2"]:
     return torch.stack([columns, rows], -1).float() + 0.5
 
 
-def look_at(
-    position: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-) -> np.ndarray:
+def look_at(position: np.ndarray, target: np.ndarray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> np.ndarray:
     """`world_from_camera` [4, 4] of a camera at `position` that looks at `target`."""
     position, target = np.asarray(position, np.float64), np.asarray(target, np.float64)
     backward = position - target

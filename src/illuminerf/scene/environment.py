@@ -35,9 +35,7 @@ class EnvironmentMap:
         if image.ndim != 3 or image.shape[2] != 3 or image.shape[1] != 2 * image.shape[0] or image.size == 0:
             raise UserError(
                 f"{label} is not an equirectangular map",
-                got=f"{image.shape[1]} x {image.shape[0]} pixels"
-                if image.ndim == 3
-                else f"shape {image.shape}",
+                got=f"{image.shape[1]} x {image.shape[0]} pixels" if image.ndim == 3 else f"shape {image.shape}",
                 wanted="width twice the height, 3 channels",
                 fix="crop or resample it to 2:1",
             )
@@ -67,9 +65,7 @@ class EnvironmentMap:
         path = Path(path)
         suffix = path.suffix.lower()
         if not path.is_file():
-            raise UserError(
-                f"the light {path} does not exist", wanted="an .exr or .hdr file", fix="check the path"
-            )
+            raise UserError(f"the light {path} does not exist", wanted="an .exr or .hdr file", fix="check the path")
         if suffix == ".exr":
             image = read_rgb_exr(path)
         elif suffix == ".hdr":

@@ -19,9 +19,7 @@ def srgb_from_linear(linear_rgb: Array) -> Array:
     """sRGB coding (IEC 61966-2-1) of linear values; the power law goes on above 1, unclipped."""
     if isinstance(linear_rgb, Tensor):
         value = linear_rgb.clamp_min(0.0)
-        return torch.where(
-            value <= 0.0031308, 12.92 * value, 1.055 * value.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
-        )
+        return torch.where(value <= 0.0031308, 12.92 * value, 1.055 * value.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
     value = np.maximum(linear_rgb, 0)
     return np.where(
         value <= 0.0031308, 12.92 * value, 1.055 * np.maximum(value, 0.0031308) ** (1 / 2.4) - 0.055
@@ -32,13 +30,11 @@ def linear_from_srgb(srgb: Array) -> Array:
     """Inverse of `srgb_from_linear`."""
     if isinstance(srgb, Tensor):
         value = srgb.clamp_min(0.0)
-        return torch.where(
-            value <= 0.04045, value / 12.92, ((value.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4
-        )
+        return torch.where(value <= 0.04045, value / 12.92, ((value.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
     value = np.maximum(srgb, 0)
-    return np.where(
-        value <= 0.04045, value / 12.92, ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4
-    ).astype(srgb.dtype)
+    return np.where(value <= 0.04045, value / 12.92, ((np.maximum(value, 0.04045) + 0.055) / 1.055) ** 2.4).astype(
+        srgb.dtype
+    )
 
 
 def composite(srgb: Array, alpha: Array, background: float) -> Array:
@@ -59,9 +55,7 @@ def read_png(path: Path) -> np.ndarray:
     except FileNotFoundError as error:
         raise UserError(f"{path} is missing", fix="check the path") from error
     except (OSError, SyntaxError, ValueError) as error:
-        raise UserError(
-            f"{path} is not a readable image", got=str(error), fix="export it again as PNG"
-        ) from error
+        raise UserError(f"{path} is not a readable image", got=str(error), fix="export it again as PNG") from error
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
@@ -97,9 +91,7 @@ def write_exr(path: Path, channels: dict[str, np.ndarray], half: bool = True) ->
     """
     kind = np.float16 if half else np.float32
     limit = float(np.finfo(kind).max)
-    pixels = {
-        name: np.ascontiguousarray(np.clip(c, -limit, limit).astype(kind)) for name, c in channels.items()
-    }
+    pixels = {name: np.ascontiguousarray(np.clip(c, -limit, limit).astype(kind)) for name, c in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary:
         OpenEXR.File(header, pixels).write(str(temporary))

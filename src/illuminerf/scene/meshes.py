@@ -31,9 +31,7 @@ class TriangleMesh:
 
     def __post_init__(self) -> None:
         if len(self.vertices) == 0 or len(self.faces) == 0:
-            raise UserError(
-                "the mesh is empty", got=f"{len(self.vertices)} vertices, {len(self.faces)} faces"
-            )
+            raise UserError("the mesh is empty", got=f"{len(self.vertices)} vertices, {len(self.faces)} faces")
         if not np.isfinite(self.vertices).all() or not np.isfinite(self.vertex_normals).all():
             raise UserError("the mesh has NaN or infinite vertices or normals", fix="repair the mesh")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
@@ -67,18 +65,16 @@ class TriangleMesh:
             scene = trimesh.load_scene(str(path), file_type="glb", process=False)
             parts = [_placed(scene, node) for node in scene.graph.nodes_geometry]
         except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
-            raise UserError(
-                f"{path} is not a readable GLB mesh", got=str(error), fix="export it again"
-            ) from error
+            raise UserError(f"{path} is not a readable GLB mesh", got=str(error), fix="export it again") from error
         parts = [part for part in parts if part is not None]
         if not parts:
             raise UserError(f"{path} holds no triangles")
         firsts = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts[:-1]])
         return TriangleMesh(
             np.concatenate([vertices for vertices, _, _ in parts]),
-            np.concatenate(
-                [faces + first for (_, faces, _), first in zip(parts, firsts, strict=True)]
-            ).astype(np.int32),
+            np.concatenate([faces + first for (_, faces, _), first in zip(parts, firsts, strict=True)]).astype(
+                np.int32
+            ),
             np.concatenate([normals for _, _, normals in parts]),
         )
 

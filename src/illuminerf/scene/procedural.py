@@ -1,7 +1,7 @@
 """Objects and lights made from formulas: what the bundled demo capture shows.
 
-Signed distances are negative inside. Points are float [..., 3] in a z-up world; the whole still life fits into the
-unit ball.
+Signed distances are negative inside. Points are float [..., 3] in a z-up world; the whole still life fits into
+the unit ball.
 """
 
 from dataclasses import dataclass
@@ -43,12 +43,8 @@ def studio_light(height: int = 64) -> EnvironmentMap:
     blank = EnvironmentMap(np.ones((height, 2 * height, 3), np.float32), "studio")
     directions = blank.directions()
     image = np.full(directions.shape, 0.32) + 0.18 * directions[..., 2:]
-    image = image + _lobe(directions, azimuth=0.5, elevation=0.7, degrees=24)[..., None] * np.array(
-        [6.0, 6.2, 6.6]
-    )
-    image = image + _lobe(directions, azimuth=-2.0, elevation=0.35, degrees=16)[..., None] * np.array(
-        [5.0, 3.9, 2.6]
-    )
+    image = image + _lobe(directions, azimuth=0.5, elevation=0.7, degrees=24)[..., None] * np.array([6.0, 6.2, 6.6])
+    image = image + _lobe(directions, azimuth=-2.0, elevation=0.35, degrees=16)[..., None] * np.array([5.0, 3.9, 2.6])
     return EnvironmentMap(np.maximum(image, 0.02).astype(np.float32), "studio")
 
 
@@ -67,9 +63,7 @@ def evening_light(height: int = 64) -> EnvironmentMap:
 
 def _lobe(directions: np.ndarray, azimuth: float, elevation: float, degrees: float) -> np.ndarray:
     """A disc of light with a soft edge, 1 in its middle."""
-    centre = np.array(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-    )
+    centre = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     angle = np.degrees(np.arccos(np.clip(directions @ centre, -1, 1)))
     return 1 / (1 + np.exp(np.clip((angle - degrees) / (0.08 * degrees), -50, 50)))
 
@@ -86,7 +80,7 @@ def _meshed(distance, color, resolution: int) -> TriangleMesh:  # type: ignore[n
     normals = gradient / np.maximum(np.linalg.norm(gradient, axis=-1, keepdims=True), 1e-12)
     return TriangleMesh(
         vertices.astype(np.float32),
-        np.ascontiguousarray(faces[:, ::-1], np.int32),  # skimage winds toward the inside
+        np.ascontiguousarray(faces, np.int32),
         normals.astype(np.float32),
         np.clip(color(vertices), 0, 1).astype(np.float32),
     )
@@ -142,9 +136,7 @@ def _board(p: np.ndarray) -> np.ndarray:
 
 
 def _board_color(p: np.ndarray) -> np.ndarray:
-    ring = np.linalg.norm(p[..., :2] - np.array([0.9, -0.5]), axis=-1) + 0.03 * np.sin(
-        7 * p[..., 0] + 3 * p[..., 1]
-    )
+    ring = np.linalg.norm(p[..., :2] - np.array([0.9, -0.5]), axis=-1) + 0.03 * np.sin(7 * p[..., 0] + 3 * p[..., 1])
     grain = 0.5 + 0.5 * np.sin(48 * ring)
     return np.array([0.50, 0.31, 0.17]) + grain[..., None] * np.array([0.16, 0.11, 0.07])
 

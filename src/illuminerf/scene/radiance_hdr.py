@@ -35,9 +35,7 @@ def read_hdr(path: Path) -> np.ndarray:
     try:
         rgbe = _scanlines(body, height, width)
     except (IndexError, ValueError) as error:
-        raise UserError(
-            f"{path} is truncated or damaged", got=str(error), fix="download or export it again"
-        ) from error
+        raise UserError(f"{path} is truncated or damaged", got=str(error), fix="download or export it again") from error
     scale = np.ldexp(np.float32(1), rgbe[..., 3:].astype(np.int32) - 136)
     return np.where(rgbe[..., 3:] > 0, (rgbe[..., :3] + np.float32(0.5)) * scale, np.float32(0))
 

@@ -119,9 +119,7 @@ def _check_key(out: Path, key: dict[str, Any], made_from: dict[str, str]) -> boo
         raise UserError(f"{out} is a file", wanted="a folder", fix="choose another --out")
     config_file, inputs_file = out / "config.json", out / "inputs.json"
     if not config_file.exists():
-        strangers = (
-            [entry.name for entry in out.iterdir() if entry.name not in _OWN_FILES] if out.exists() else []
-        )
+        strangers = [entry.name for entry in out.iterdir() if entry.name not in _OWN_FILES] if out.exists() else []
         if strangers:
             raise UserError(
                 f"{out} holds files that are not a run of this program",
@@ -206,9 +204,7 @@ def _locked(out: Path) -> Iterator[None]:
         out.mkdir(parents=True, exist_ok=True)
         handle = os.open(out / ".lock", os.O_CREAT | os.O_RDWR, 0o644)
     except OSError as error:
-        raise UserError(
-            f"{out} cannot be written", got=str(error.strerror), fix="choose another --out"
-        ) from error
+        raise UserError(f"{out} cannot be written", got=str(error.strerror), fix="choose another --out") from error
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

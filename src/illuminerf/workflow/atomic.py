@@ -24,9 +24,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(
-            prefix=f".{path.stem}.", suffix=f".partial{path.suffix}", dir=path.parent
-        )
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".partial{path.suffix}", dir=path.parent)
         os.close(handle)
     except OSError as error:
         raise _explained(error, path) from error
@@ -87,9 +85,7 @@ def _explained(error: OSError, path: Path) -> Exception:
             fix="free some space and run the same command again; finished work is kept",
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return UserError(
-            f"{path} cannot be written", got=error.strerror or str(error), fix="choose another --out"
-        )
+        return UserError(f"{path} cannot be written", got=error.strerror or str(error), fix="choose another --out")
     if error.errno in (errno.ENOTDIR, errno.EEXIST):
         return UserError(f"{path.parent} is not a folder", fix="choose another --out")
     return error

@@ -19,9 +19,7 @@ def save_checkpoint(path: Path, tensors: dict[str, Tensor], metadata: dict[str, 
     write_bytes(path, save(contiguous, metadata={"illuminerf": json.dumps(metadata, sort_keys=True)}))
 
 
-def load_checkpoint(
-    path: Path, device: torch.device | str = "cpu"
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read what `save_checkpoint` wrote: (tensors by name, metadata).
 
     Raises:
@@ -35,9 +33,7 @@ def load_checkpoint(
     except FileNotFoundError as error:
         raise UserError(f"{path} is missing", fix="run the stage that makes it again") from error
     except (SafetensorError, ValueError, OSError) as error:
-        raise UserError(
-            f"{path} is corrupt", got=str(error), fix="delete its folder and run again"
-        ) from error
+        raise UserError(f"{path} is corrupt", got=str(error), fix="delete its folder and run again") from error
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str = "optimizer") -> dict[str, Tensor]:
@@ -49,9 +45,7 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str = "optimizer
     }
 
 
-def restore_optimizer(
-    optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], prefix: str = "optimizer"
-) -> None:
+def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], prefix: str = "optimizer") -> None:
     """Put back what `optimizer_tensors` took."""
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():

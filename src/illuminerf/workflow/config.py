@@ -38,14 +38,10 @@ def from_json(cls: type[ConfigType], content: dict[str, Any]) -> ConfigType:
         raise UserError(f"{cls.__name__} has no field '{unknown[0]}'", wanted=", ".join(fields))
     hints = typing.get_type_hints(cls)
     for name, field in fields.items():
-        has_default = not (
-            field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        )
+        has_default = not (field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING)
         if name not in content and not has_default:
             raise UserError(f"{cls.__name__} lacks the field '{name}'")
-    return cls(
-        **{name: _coerced(f"{cls.__name__}.{name}", hints[name], value) for name, value in content.items()}
-    )
+    return cls(**{name: _coerced(f"{cls.__name__}.{name}", hints[name], value) for name, value in content.items()})
 
 
 def _coerced(name: str, hint: Any, value: Any) -> Any:
@@ -66,9 +62,7 @@ def _coerced(name: str, hint: Any, value: Any) -> Any:
         return tuple(_coerced(name, item, entry) for item, entry in zip(items, value, strict=True))
     if origin is typing.Literal:
         if value not in arguments:
-            raise UserError(
-                f"{name} is not a known choice", got=repr(value), wanted=", ".join(map(str, arguments))
-            )
+            raise UserError(f"{name} is not a known choice", got=repr(value), wanted=", ".join(map(str, arguments)))
         return value
     if hint is Path:
         return Path(value)

@@ -1,0 +1,185 @@
+"""The one-page HTML report of a run: one file, opens offline, pictures inside."""
+
+import base64
+import html
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from illuminerf.scene.environment import EnvironmentMap, chrome_ball
+from illuminerf.scene.images import composite, read_exr, read_png, srgb_from_linear, to_uint8
+from illuminerf.workflow.artefact import read_metrics
+from illuminerf.workflow.atomic import read_json, write_bytes
+
+_MAX_PICTURES = 6
+_CUE_TITLES = {"diffuse": "diffuse", "ggx_005": "GGX 0.05", "ggx_013": "GGX 0.13", "ggx_034": "GGX 0.34"}
+_STYLE = """
+:root { color-scheme: light dark; --line: #8884; }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { margin-bottom: 0 } h2 { margin-top: 2.2rem; border-bottom: 1px solid var(--line) } p.note { opacity: .75 }
+.row { display: flex; flex-wrap: wrap; gap: .6rem; align-items: flex-end } figure { margin: 0 }
+figcaption { font-size: .8rem; opacity: .75; text-align: center } img, video { border-radius: 6px; max-width: 100% }
+img { image-rendering: auto; height: 9.5rem } img.wide { height: 7rem } video { height: 18rem; background: #fff }
+table { border-collapse: collapse } td, th { padding: .25rem .9rem .25rem 0; text-align: right }
+td:first-child, th:first-child { text-align: left } th { border-bottom: 1px solid var(--line) }
+"""
+
+
+def write_report(
+    out: Path,
+    run: Path,
+    stages: dict[str, Path],
+    lights: dict[str, dict[str, Path]],
+    scores: dict[str, Any] | None = None,
+) -> Path:
+    """Gather what the stages made into `out`.
+
+    Args:
+        out: the HTML file to write.
+        run: the run's folder; its name is the title.
+        stages: artefacts all lights share: "capture", "geometry".
+        lights: for each light's name its artefacts: "cues", "relit", "latent_nerf", "turntable", and the file
+            "video" where there is one.
+        scores: rows to print under "Scores", or None.
+    """
+    body = [f"<h1>{html.escape(run.resolve().name)}</h1><p class=note>Open IllumiNeRF: one object, relit.</p>"]
+    body += [_inputs(stages["capture"]), _geometry(stages["geometry"])]
+    for name, artefacts in lights.items():
+        body.append(_light(name, artefacts, stages["capture"]))
+    if scores:
+        body.append(_scores(scores))
+    body.append(_costs(stages, lights))
+    page = (
+        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
+        f"<title>{html.escape(run.resolve().name)} - Open IllumiNeRF</title><style>{_STYLE}</style>"
+        f"<body>{''.join(body)}</body></html>\n"
+    )
+    write_bytes(out, page.encode())
+    return out
+
+
+def _inputs(capture: Path) -> str:
+    files = sorted((capture / "images").glob("*.png"))
+    pictures = [(_on_white(read_png(path)), path.stem) for path in _spread(files)]
+    return f"<h2>Input: {len(files)} photographs</h2>{_row(pictures)}"
+
+
+def _geometry(geometry: Path) -> str:
+    normals = sorted((geometry / "normals").glob("*.png"))
+    pictures = [(read_png(path)[..., :3], f"normals {path.stem}") for path in _spread(normals)]
+    return f"<h2>Geometry</h2>{_row(pictures)}"
+
+
+def _light(name: str, artefacts: dict[str, Path], capture: Path) -> str:
+    light = EnvironmentMap.load(artefacts["cues"] / "light.exr")
+    ball, alpha = chrome_ball(light, 160)
+    exposure = _exposure(light.linear_rgb)
+    panorama = np.clip(srgb_from_linear(light.linear_rgb * exposure), 0, 1)
+    ball_srgb = composite(np.clip(srgb_from_linear(ball * exposure), 0, 1), alpha, 1.0)
+    parts = [f"<h2>Light: {html.escape(name)}</h2>"]
+    parts.append(
+        _row(
+            [
+                (panorama, "the light, left to right: azimuth +180 to -180 degrees"),
+                (ball_srgb, "on a mirror ball"),
+            ]
+        )
+    )
+    if "video" in artefacts:
+        encoded = base64.b64encode(artefacts["video"].read_bytes()).decode()
+        parts.append(
+            f"<h3>Relit</h3><video controls loop muted autoplay src='data:video/mp4;base64,{encoded}'></video>"
+        )
+    frames = sorted((artefacts["turntable"] / "images").glob("*.png"))
+    parts.append(_row([(_on_white(read_png(path)), f"view {path.stem}") for path in _spread(frames)]))
+    cue_files = sorted((artefacts["cues"] / "cues").glob("*.exr"))
+    if cue_files:
+        parts.append(f"<h3>Radiance cues of photograph {cue_files[0].stem}</h3>{_row(_cue_pictures(cue_files[0]))}")
+    parts.append(_samples(artefacts["relit"], capture))
+    return "".join(parts)
+
+
+def _cue_pictures(path: Path) -> list[tuple[np.ndarray, str]]:
+    channels = read_exr(path)
+    pictures = []
+    for cue, title in _CUE_TITLES.items():
+        linear_rgb = np.stack([channels[f"{cue}.{c}"] for c in "RGB"], -1)
+        srgb = np.clip(srgb_from_linear(linear_rgb * _exposure(linear_rgb)), 0, 1)
+        pictures.append((np.clip(srgb + 1 - channels["A"][..., None], 0, 1), title))  # premultiplied, over white
+    return pictures
+
+
+def _samples(relit: Path, capture: Path) -> str:
+    files = sorted((relit / "samples").glob("*.png"))
+    views = sorted({path.stem.rsplit("_", 1)[0] for path in files})
+    parts = [f"<h3>Samples of the relighting diffusion model ({len(files)} in all)</h3>"]
+    for view in views[:: max(1, len(views) // 2)][:2]:
+        photograph = read_png(capture / "images" / f"{view}.png")
+        alpha = photograph[..., 3]
+        row = [(_on_white(photograph), f"photograph {view}")]
+        for path in [file for file in files if file.stem.startswith(f"{view}_")][: _MAX_PICTURES - 1]:
+            row.append((read_png(path)[..., :3] + (1 - alpha[..., None]), f"sample {path.stem.rsplit('_', 1)[1]}"))
+        parts.append(_row(row))
+    return "".join(parts)
+
+
+def _scores(scores: dict[str, Any]) -> str:
+    rows = "".join(
+        f"<tr><td>{html.escape(str(name))}</td><td>{value:.3f}</td></tr>"
+        for name, value in scores.items()
+        if isinstance(value, (int, float))
+    )
+    note = "<p class=note>On views that were not photographed, per-channel rescaled as in the TensoIR benchmark.</p>"
+    return f"<h2>Scores</h2>{note}<table>{rows}</table>"
+
+
+def _costs(stages: dict[str, Path], lights: dict[str, dict[str, Path]]) -> str:
+    rows = [("all lights", name, path) for name, path in stages.items()]
+    rows += [(light, name, path) for light, made in lights.items() for name, path in made.items() if name != "video"]
+    lines = []
+    for light, name, path in rows:
+        metrics = read_metrics(path)
+        lines.append(
+            f"<tr><td>{html.escape(name.replace('_', ' '))}</td><td>{html.escape(light)}</td>"
+            f"<td>{metrics['seconds']:.1f}</td><td>{metrics['peak_memory_gb']:.2f}</td></tr>"
+        )
+    versions = read_json(next(iter(stages.values())) / "provenance.json")
+    note = html.escape(", ".join(f"{name} {version}" for name, version in versions["versions"].items()))
+    head = "<tr><th>stage</th><th>light</th><th>seconds</th><th>peak memory, GB</th></tr>"
+    return f"<h2>Cost</h2><table>{head}{''.join(lines)}</table><p class=note>{note}; {html.escape(versions['platform'])}</p>"
+
+
+def _exposure(linear_rgb: np.ndarray) -> float:
+    """A factor for looking at radiance: the mean of what is lit becomes a mid grey."""
+    lit = linear_rgb[linear_rgb.max(-1) > 1e-4]
+    return float(np.clip(0.35 / max(float(np.minimum(lit, 4).mean()), 1e-6), 0.05, 8)) if lit.size else 1.0
+
+
+def _spread(files: Sequence[Path]) -> list[Path]:
+    count = min(len(files), _MAX_PICTURES)
+    return [files[int(i)] for i in np.linspace(0, len(files) - 1, count)] if files else []
+
+
+def _on_white(rgba: np.ndarray) -> np.ndarray:
+    return composite(rgba[..., :3], rgba[..., 3], 1.0) if rgba.shape[-1] == 4 else rgba
+
+
+def _row(pictures: list[tuple[np.ndarray, str]]) -> str:
+    figures = "".join(
+        f"<figure><img {'class=wide' if image.shape[1] > 1.6 * image.shape[0] else ''} src='{_data_url(image)}' "
+        f"alt='{html.escape(title)}'><figcaption>{html.escape(title)}</figcaption></figure>"
+        for image, title in pictures
+    )
+    return f"<div class=row>{figures}</div>"
+
+
+def _data_url(image: np.ndarray) -> str:
+    buffer = io.BytesIO()
+    picture = Image.fromarray(to_uint8(image))
+    picture.thumbnail((640, 640))
+    picture.save(buffer, "PNG", optimize=True)
+    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
