@@ -1,0 +1,129 @@
+"""The capture: posed images of one object under one unknown light, in the unit ball, on disk and in memory.
+
+capture.json          scale, offset (p' = (p + offset) * scale from the caller's world), background, names
+cameras.json          `Cameras.to_dict()`, in the unit ball's world
+images/<000>.png      8-bit sRGB, straight RGBA; all of one size, undistorted
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from illuminerf.scene.cameras import Cameras
+from illuminerf.scene.images import read_png, write_png
+from illuminerf.scene.views import Views
+from illuminerf.workflow.atomic import read_json, write_json
+from illuminerf.workflow.errors import UserError
+
+Background = Literal["masked", "opaque"]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Views of one object in the unit ball, and the way back to the caller's world."""
+
+    views: Views
+    names: tuple[str, ...]
+    """The image's name in the caller's folder, per view."""
+    scale: float = 1.0
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """float64 [3]; a point p of the caller's world is at (p + offset) * scale here."""
+    background: Background = "masked"
+    """"masked": alpha separates the object from what is behind it; "opaque": alpha is 1 wherever the camera
+    saw.
+    """
+
+    def __post_init__(self) -> None:
+        if len(self.names) != len(self.views):
+            raise ValueError(f"{len(self.names)} names for {len(self.views)} views")
+        if self.offset.shape != (3,) or not np.isfinite(self.offset).all() or not 0 < self.scale < np.inf:
+            raise ValueError(f"scale {self.scale}, offset {self.offset}: want a positive number and three numbers")
+
+    def unit_ball_cameras(self, cameras: Cameras) -> Cameras:
+        """Cameras of the caller's world (test views, for instance) in this capture's unit ball."""
+        return cameras.transformed(self.scale, self.offset)
+
+    def caller_cameras(self, cameras: Cameras) -> Cameras:
+        """The reverse of `unit_ball_cameras`."""
+        return cameras.transformed(1 / self.scale, -self.offset * self.scale)
+
+
+def image_path(folder: Path, view: int) -> Path:
+    """images/<000>.png of the capture in `folder`."""
+    return folder / "images" / f"{view:03d}.png"
+
+
+def write_capture(
+    folder: Path,
+    images: Iterable[np.ndarray],
+    cameras: Cameras,
+    names: Sequence[str],
+    scale: float,
+    offset: np.ndarray,
+    background: Background,
+) -> None:
+    """Write a capture's files; `images` are float [height, width, 4] in [0, 1] and may be made one at a
+    time.
+    """
+    for view, image in enumerate(images):
+        write_png(image_path(folder, view), image)
+    write_json(folder / "cameras.json", cameras.to_dict())
+    write_json(
+        folder / "capture.json",
+        {"scale": scale, "offset": offset.tolist(), "background": background, "names": list(names)},
+    )
+
+
+def save_capture(folder: Path, capture: Capture) -> None:
+    """Write `capture` as a plain folder that `load_capture` and `import_capture` read."""
+    images = (np.dstack([srgb, alpha]) for srgb, alpha in zip(capture.views.srgb, capture.views.alpha, strict=True))
+    write_capture(
+        folder, images, capture.views.cameras, capture.names, capture.scale, capture.offset, capture.background
+    )
+
+
+def load_capture(folder: Path) -> Capture:
+    """Read the capture in `folder`.
+
+    Raises UserError where it is missing, unfinished, corrupt, or its images are not those of its cameras.
+    """
+    if not (folder / "capture.json").is_file():
+        raise UserError(
+            f"{folder} is not a capture", got="no capture.json", wanted="what `import_capture` writes",
+            fix="import the images first",
+        )  # fmt: skip
+    if (folder / "config.json").exists() and not (folder / "DONE").exists():
+        raise UserError(f"the capture {folder} is unfinished", fix="import it again; what is done is kept")
+    content = read_json(folder / "capture.json")
+    cameras = Cameras.from_dict(read_json(folder / "cameras.json"))
+    num_views = len(cameras)
+    srgb = np.empty((num_views, cameras.height, cameras.width, 3), np.float32)
+    alpha = np.empty((num_views, cameras.height, cameras.width), np.float32)
+    for view in range(num_views):
+        image = read_png(image_path(folder, view))
+        if image.shape != (cameras.height, cameras.width, 4):
+            raise UserError(
+                f"image {view} of the capture {folder} has the wrong shape",
+                got=" x ".join(map(str, image.shape)),
+                wanted=f"{cameras.height} x {cameras.width} x 4",
+                fix="import the capture again into a new folder",
+            )
+        srgb[view], alpha[view] = image[..., :3], image[..., 3]
+    try:
+        return Capture(
+            Views(cameras, srgb, alpha),
+            tuple(map(str, content["names"])),
+            float(content["scale"]),
+            np.array(content["offset"], np.float64),
+            "masked" if content["background"] == "masked" else "opaque",
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{folder / 'capture.json'} is not that of a capture",
+            got=f"{type(error).__name__}: {error}",
+            wanted="scale, offset, background and one name per view",
+            fix="import the capture again into a new folder",
+        ) from error
