@@ -53,10 +53,10 @@ def evening_light(height: int = 64) -> EnvironmentMap:
     blank = EnvironmentMap(np.ones((height, 2 * height, 3), np.float32), "evening")
     directions = blank.directions()
     up = directions[..., 2:]
-    sky = np.array([0.22, 0.34, 0.62]) * (0.35 + 0.65 * np.maximum(up, 0))
-    glow = _lobe(directions, azimuth=2.6, elevation=0.1, degrees=40)[..., None] * np.array([0.9, 0.4, 0.16])
-    sun = _lobe(directions, azimuth=2.6, elevation=0.42, degrees=7)[..., None] * np.array([62.0, 40.0, 20.0])
-    ground = np.array([0.11, 0.085, 0.06])
+    sky = np.array([0.38, 0.56, 0.98]) * (0.35 + 0.65 * np.maximum(up, 0))
+    glow = _lobe(directions, azimuth=2.6, elevation=0.1, degrees=40)[..., None] * np.array([1.4, 0.65, 0.26])
+    sun = _lobe(directions, azimuth=2.6, elevation=0.42, degrees=7)[..., None] * np.array([95.0, 62.0, 32.0])
+    ground = np.array([0.17, 0.13, 0.09])
     image = np.where(up > 0, sky, ground) + glow + sun
     return EnvironmentMap(image.astype(np.float32), "evening")
 

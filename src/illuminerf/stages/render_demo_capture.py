@@ -1,0 +1,105 @@
+"""Formulas -> the capture that ships with the package: photographs under one light, truth under another.
+
+images/<000>.png, cameras.json        the photographs, in the plain layout of docs/captures.md
+test/cameras.json                     views that were not photographed
+test/<light>/<000>.png                their truth under the input and the target light, straight RGBA
+lights/<light>.exr                    both lights; a relighting is told the target's only
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from illuminerf.cues.materials import Material
+from illuminerf.cues.shading import render_shaded
+from illuminerf.scene.cameras import Cameras, sphere_cameras
+from illuminerf.scene.environment import EnvironmentMap
+from illuminerf.scene.images import linear_from_srgb, write_png
+from illuminerf.scene.procedural import duck_still_life, evening_light, studio_light
+from illuminerf.scene.views import Views
+from illuminerf.workflow.artefact import open_artefact
+from illuminerf.workflow.atomic import write_json
+from illuminerf.workflow.device import numpy_generator
+from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.progress import track
+
+
+@dataclass(frozen=True)
+class Config:
+    """Size and quality of the demo capture."""
+
+    num_views: int = 30
+    """Photographs."""
+    num_test_views: int = 8
+    """Views with truth under both lights."""
+    size: int = 128
+    """Pixels along each side."""
+    samples_per_pixel: int = 1024
+    """Paths per pixel."""
+    mesh_resolution: int = 160
+    """Grid points per axis for the marching cubes of each object."""
+    seed: int = 0
+    """Of the cameras and the paths."""
+
+    def __post_init__(self) -> None:
+        if min(self.num_views, self.num_test_views) < 3 or self.size < 16:
+            raise UserError("the demo capture is too small", wanted="at least 3 views of each kind, 16 pixels")
+
+
+def run(config: Config, out: Path) -> Path:
+    """Render the capture into `out`."""
+    with open_artefact(out, "render_demo_capture", config, {}) as artefact:
+        if artefact.is_done:
+            return out
+        parts = [
+            (o.mesh, Material(linear_from_srgb(_vertex_colors(o.mesh.vertex_colors)), o.roughness, o.metallic))
+            for o in duck_still_life(config.mesh_resolution)
+        ]
+        studio, evening = studio_light(), evening_light()
+        photographed = _cameras(config.num_views, "photographs", config)
+        _write(out, "images", photographed, parts, studio, config)
+        write_json(out / "cameras.json", photographed.to_dict())
+        unseen = _cameras(config.num_test_views, "test", config)
+        write_json(out / "test" / "cameras.json", unseen.to_dict())
+        for light in (studio, evening):
+            _write(out, f"test/{light.name}", unseen, parts, light, config)
+            light.save(out / "lights" / f"{light.name}.exr")
+        artefact.finish({"views": config.num_views, "test_views": config.num_test_views})
+    return out
+
+
+def _vertex_colors(srgb: np.ndarray | None) -> np.ndarray:
+    if srgb is None:
+        raise UserError("a procedural object has no vertex colours")
+    return srgb
+
+
+def _cameras(num_views: int, name: str, config: Config) -> Cameras:
+    return sphere_cameras(
+        num_views,
+        radius=3.4,
+        fov_radians=np.radians(33),
+        height=config.size,
+        width=config.size,
+        generator=numpy_generator(config.seed, "cameras", name),
+        min_elevation_radians=np.radians(8),
+        max_elevation_radians=np.radians(72),
+    )
+
+
+def _write(
+    out: Path,
+    folder: str,
+    cameras: Cameras,
+    parts: list,  # type: ignore[type-arg]
+    light: EnvironmentMap,
+    config: Config,
+) -> None:
+    for view in track(range(len(cameras)), f"render {folder}"):
+        path = out / folder / f"{view:03d}.png"
+        if path.exists():
+            continue
+        seed = config.seed + 1000 * view
+        views: Views = render_shaded(parts, cameras[view], light, config.samples_per_pixel, seed)
+        write_png(path, np.dstack([views.srgb[0], views.alpha[0]]))
