@@ -1,0 +1,133 @@
+"""The whole method on one page.
+
+    photographs --import--> capture --UniSDF--> geometry            once per object
+    geometry + light --path tracer--> radiance cues                 once per light, from here on
+    capture + cues --relighting diffusion model--> S samples of every photograph
+    samples + geometry --latent NeRF--> one relit object
+    relit object --render--> turntable, unseen views, scores
+
+Every line is one stage: a Config and a run(), which loads what is finished, goes on with what is not, and refuses
+what was made with other settings. Started again after a kill, this page continues where it stopped.
+"""
+
+import dataclasses
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from illuminerf.presets import Preset
+from illuminerf.report import write_report
+from illuminerf.scene.environment import EnvironmentMap
+from illuminerf.scene.images import composite, read_png
+from illuminerf.scene.video import write_mp4
+from illuminerf.stages import (
+    estimate_geometry,
+    evaluate_relighting,
+    fit_latent_nerf,
+    import_capture,
+    relight_views,
+    render_novel_views,
+    render_radiance_cues,
+)
+from illuminerf.workflow.artefact import read_metrics
+from illuminerf.workflow.atomic import atomic_path, write_json
+from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.progress import say
+
+
+@dataclass(frozen=True)
+class LightJob:
+    """One target light, and what the caller wants of it beside the turntable."""
+
+    light: Path
+    """EXR or HDR environment map."""
+    test_cameras: Path | None = None
+    """cameras.json, in the caller's world, of further views to render."""
+    truth: Path | None = None
+    """Folder with the truth of those views under this light, <000>.png straight RGBA."""
+
+    @property
+    def name(self) -> str:
+        return self.light.stem
+
+
+def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -> dict[str, Any]:
+    """Relight the capture in `source` under every light of `jobs`; geometry is estimated once.
+
+    Returns:
+        By light, its scores where there is truth ({"psnr": ..., "ssim": ...}).
+
+    Raises:
+        UserError: bad input, or `out` was made with other settings.
+    """
+    _check(jobs)
+    capture = import_capture.run(source, preset.capture, out / "capture")
+    geometry = estimate_geometry.run(capture, preset.geometry, out / "geometry")
+    _copy(geometry / "mesh.glb", out / "mesh.glb")
+    lights: dict[str, dict[str, Path]] = {}
+    scores: dict[str, Any] = {}
+    for job in jobs:
+        say(f"light: {job.name}")
+        folder = out / "lights" / job.name
+        made = lights[job.name] = relight_under(capture, geometry, job.light, preset, folder)
+        if job.test_cameras is not None:
+            made["test_views"] = render_novel_views.run(
+                made["latent_nerf"], dataclasses.replace(preset.test_views, cameras=job.test_cameras), folder / "test_views"
+            )
+        if job.test_cameras is not None and job.truth is not None:
+            made["scores"] = evaluate_relighting.run(
+                made["test_views"], job.truth, preset.evaluation, folder / "scores"
+            )
+            scores[job.name] = read_metrics(made["scores"])
+    first = lights[jobs[0].name]
+    _copy(first["video"], out / "turntable.mp4")
+    write_report(out / "report.html", out, {"capture": capture, "geometry": geometry}, lights, scores)
+    return scores
+
+
+def relight_under(capture: Path, geometry: Path, light: Path, preset: Preset, out: Path) -> dict[str, Path]:
+    """The per-light half of the method; returns its artefacts by name."""
+    cues = render_radiance_cues.run(geometry, capture, light, preset.cues, out / "cues")
+    relit = relight_views.run(capture, cues, preset.relighting_model, preset.relighting, out / "relit")
+    latent_nerf = fit_latent_nerf.run(geometry, capture, relit, preset.latent_nerf, out / "latent_nerf")
+    turntable = render_novel_views.run(latent_nerf, preset.turntable, out / "turntable")
+    video = out / "turntable.mp4"
+    if not video.exists():
+        frames = sorted((turntable / "images").glob("*.png"))
+        images = (read_png(frame) for frame in frames)
+        write_mp4(video, (composite(image[..., :3], image[..., 3], 1.0) for image in images))
+    return {"cues": cues, "relit": relit, "latent_nerf": latent_nerf, "turntable": turntable, "video": video}
+
+
+def seconds_by_stage(run: Path) -> dict[str, float]:
+    """What each stage of a run took, from the artefacts' own records; stages of several lights are added up."""
+    seconds: dict[str, float] = {}
+    for provenance in sorted(run.rglob("provenance.json")):
+        stage = provenance.parent.name
+        seconds[stage] = seconds.get(stage, 0.0) + read_metrics(provenance.parent)["seconds"]
+    return seconds
+
+
+def peak_memory_gb(run: Path) -> float:
+    """The largest peak of any stage of a run."""
+    return max(float(read_metrics(p.parent)["peak_memory_gb"]) for p in run.rglob("provenance.json"))
+
+
+def _check(jobs: Sequence[LightJob]) -> None:
+    """Find bad lights before hours are spent on the geometry."""
+    if not jobs:
+        raise UserError("no light was given", fix="name at least one with --light")
+    names = [job.name for job in jobs]
+    if len(set(names)) < len(names):
+        raise UserError("two lights have the same name", got=", ".join(names), fix="rename one of the files")
+    for job in jobs:
+        EnvironmentMap.load(job.light)
+
+
+def _copy(source: Path, target: Path) -> None:
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)
