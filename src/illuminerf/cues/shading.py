@@ -1,0 +1,157 @@
+"""Renderings of objects with metallic-roughness materials: training targets and made-up captures."""
+
+from typing import Any
+
+import numpy as np
+
+from illuminerf.cues.materials import Material
+from illuminerf.cues.mitsuba_scene import MitsubaScene, mitsuba_mesh
+from illuminerf.cues.mitsuba_variant import load_mitsuba
+from illuminerf.scene.cameras import Cameras
+from illuminerf.scene.environment import EnvironmentMap
+from illuminerf.scene.images import srgb_from_linear
+from illuminerf.scene.meshes import TriangleMesh
+from illuminerf.scene.views import Views
+from illuminerf.workflow.device import derived_seed
+
+_PATH_DEPTH = 6
+_PROPERTY_SAMPLES = 16
+
+
+class ShadedScene:
+    """Objects with their materials; lights and cameras may change, geometry is built once.
+
+    Args:
+        parts: meshes in the world of the cameras, each with its material.
+        light: the first light; its resolution is that of all later ones.
+        device: "auto", "cpu" or "cuda".
+    """
+
+    def __init__(self, parts: list[tuple[TriangleMesh, Material]], light: EnvironmentMap, device: str = "auto") -> None:
+        self._parts, self._first_light, self._device = _merged(parts), light, device
+        shapes = {f"part{i}": _shape(mesh, material, device) for i, (mesh, material) in enumerate(self._parts)}
+        self._scene = MitsubaScene(shapes, light, device)
+        self._light: EnvironmentMap | None = None
+
+    def render(
+        self, cameras: Cameras, view: int, light: EnvironmentMap, samples_per_pixel: int, seed: int
+    ) -> np.ndarray:
+        """One view: float32 [height, width, 4], linear premultiplied radiance and coverage."""
+        if light is not self._light:
+            self._scene.set_light(light)
+            self._light = light
+        return self._scene.render(cameras, view, _PATH_DEPTH, samples_per_pixel, seed)
+
+    def properties(self, cameras: Cameras, view: int) -> dict[str, np.ndarray]:
+        """What the surface is, without light: base_color [h, w, 3] linear, roughness and metallic [h, w] and the
+        world-space shading normal [h, w, 3] turned towards the camera. 0 where nothing is seen."""
+        shapes = {f"part{i}": _shape(m, material, self._device, "color") for i, (m, material) in enumerate(self._parts)}
+        others = {
+            f"part{i}": _shape(m, material, self._device, "others") for i, (m, material) in enumerate(self._parts)
+        }
+        dim = EnvironmentMap(np.ones((2, 4, 3), np.float32))
+        first = MitsubaScene(shapes, dim, self._device).render_aovs(
+            "color:albedo,normal:sh_normal,depth:depth", cameras, view, _PROPERTY_SAMPLES, 0
+        )
+        second = MitsubaScene(others, dim, self._device).render_aovs(
+            "other:albedo", cameras, view, _PROPERTY_SAMPLES, 0
+        )
+        return _unpacked(first, second, cameras, view)
+
+
+def render_shaded(
+    parts: list[tuple[TriangleMesh, Material]],
+    cameras: Cameras,
+    light: EnvironmentMap,
+    samples_per_pixel: int = 64,
+    seed: int = 0,
+    device: str = "auto",
+) -> Views:
+    """Path trace a capture of objects under one light, as a camera would store it.
+
+    Args:
+        parts: meshes in the world of the cameras, each with its material.
+        cameras: the views.
+        light: linear radiance; values above 1 in the picture are clipped as in an 8-bit photograph.
+        samples_per_pixel: paths per pixel.
+        seed: each view's own seed is derived from it.
+        device: "auto", "cpu" or "cuda".
+
+    Returns:
+        Views with straight sRGB and the coverage as alpha.
+    """
+    scene = ShadedScene(parts, light, device)
+    srgb, alphas = [], []
+    for view in range(len(cameras)):
+        image = scene.render(cameras, view, light, samples_per_pixel, derived_seed(seed, "view", view))
+        alpha = np.clip(image[..., 3], 0, 1)
+        straight = image[..., :3] / np.maximum(alpha, 1e-6)[..., None]
+        srgb.append(np.where(alpha[..., None] > 0, srgb_from_linear(np.clip(straight, 0, 1)), 0))
+        alphas.append(alpha)
+    return Views(cameras, np.stack(srgb).astype(np.float32), np.stack(alphas).astype(np.float32))
+
+
+def concatenated(meshes: list[TriangleMesh]) -> TriangleMesh:
+    """Several meshes as one."""
+    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
+    return TriangleMesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate(faces).astype(np.int32),
+        np.concatenate([mesh.vertex_normals for mesh in meshes]),
+    )
+
+
+def _merged(parts: list[tuple[TriangleMesh, Material]]) -> list[tuple[TriangleMesh, Material]]:
+    """Untextured parts become one mesh with per-vertex values: fewer shapes, so fewer kernels to compile."""
+    plain = [(mesh, material) for mesh, material in parts if not material.is_textured]
+    textured = [(mesh, material) for mesh, material in parts if material.is_textured]
+    if not plain:
+        return textured
+    values = [material.per_vertex(len(mesh.vertices)) for mesh, material in plain]
+    color, roughness, metallic = (np.concatenate(arrays) for arrays in zip(*values, strict=True))
+    merged = Material(color, roughness[:, 0], metallic[:, 0])
+    return [(concatenated([mesh for mesh, _ in plain]), merged), *textured]
+
+
+def _shape(mesh: TriangleMesh, material: Material, device: str, show: str = "shaded") -> Any:
+    """A Mitsuba shape that is shaded, or that shows "color" or "others" (roughness, metallic, 0) as its albedo."""
+    mi = load_mitsuba(device)
+    attributes = None
+    if material.is_textured:
+        arrays = material.images()
+        sources = [
+            {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(array)), "raw": True} for array in arrays
+        ]
+        packed: dict[str, Any] = {"type": "bitmap", "bitmap": mi.Bitmap(_packed(arrays)), "raw": True}
+    else:
+        arrays = material.per_vertex(len(mesh.vertices))
+        names = ("vertex_color", "vertex_roughness", "vertex_metallic")
+        attributes = dict(zip(names, arrays, strict=True)) | {"vertex_packed": _packed(arrays)}
+        sources = [{"type": "mesh_attribute", "name": name} for name in names]
+        packed = {"type": "mesh_attribute", "name": "vertex_packed"}
+    if show == "shaded":
+        bsdf = {"type": "principled", "base_color": sources[0], "roughness": sources[1], "metallic": sources[2]}
+    else:
+        bsdf = {"type": "diffuse", "reflectance": sources[0] if show == "color" else packed}
+    two_sided = {"type": "twosided", "front": bsdf}
+    return mitsuba_mesh(mi, "part", mesh.vertices, mesh.faces, two_sided, mesh.vertex_normals, material.uv, attributes)
+
+
+def _packed(arrays: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    return np.ascontiguousarray(np.concatenate([arrays[1], arrays[2], np.zeros_like(arrays[1])], -1))
+
+
+def _unpacked(first: np.ndarray, second: np.ndarray, cameras: Cameras, view: int) -> dict[str, np.ndarray]:
+    color, normal = first[..., :3], first[..., 3:6]
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    hit = first[..., 6:7] > 0
+    normal = np.where(hit, normal / np.maximum(length, 1e-6), 0)
+    _, directions = cameras.image_rays(view)
+    away = (normal * directions.numpy()).sum(-1, keepdims=True) > 0
+    return {
+        "base_color": color,
+        "roughness": second[..., 0],
+        "metallic": second[..., 1],
+        "normal": np.where(away, -normal, normal).astype(np.float32),
+    }
