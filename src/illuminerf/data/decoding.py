@@ -99,8 +99,8 @@ def _read_exr_premultiplied(path: Path) -> np.ndarray:
     except _DECODING_ERRORS as error:
         raise _unreadable(path, error) from error
     grey = channels.get("Y")
-    rgb = [channels.get(name, grey) for name in "RGB"]
-    if any(plane is None for plane in rgb):
+    rgb = [plane for plane in (channels.get(name, grey) for name in "RGB") if plane is not None]
+    if len(rgb) < 3:
         raise UserError(
             "an EXR image lacks colour", got=f"channels {sorted(channels)} in {path}", wanted="R, G, B [, A]"
         )

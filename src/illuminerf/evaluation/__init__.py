@@ -1,0 +1,1 @@
+"""Scores: image metrics, colour rescaling, the benchmarks' rules, tables beside the published figures."""

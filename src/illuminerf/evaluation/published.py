@@ -1,0 +1,99 @@
+"""Figures that others published, to stand beside ours; each with where it is printed.
+
+They are for the whole benchmarks (TensoIR: four scenes, five lights, 200 views each; Stanford-ORB: 14
+objects under three lights). Figures of ours over fewer scenes or lights are not comparable with them cell
+by cell; GALLERY is.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PublishedScores:
+    """One row of a published table: PSNR and SSIM, higher is better, LPIPS, lower is better."""
+
+    method: str
+    psnr: float
+    ssim: float
+    lpips: float
+    source: str
+    """The publication that prints the row."""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class PublishedOrbScores:
+    """One row of the Stanford-ORB relighting table."""
+
+    method: str
+    psnr_h: float
+    """PSNR of HDR images, in dB."""
+    psnr_l: float
+    """PSNR of sRGB images, in dB."""
+    ssim: float
+    lpips: float
+    source: str
+
+
+_ILLUMINERF = "IllumiNeRF, NeurIPS 2024"
+_ROGR = "ROGR, 2025"
+_RELIGHTABLE_3DGS = "reported by later work on the TensoIR benchmark"
+
+TENSOIR = (
+    PublishedScores("ROGR", 30.74, 0.950, 0.069, _ROGR, "128 TPUv5 of training, 8 H100"),
+    PublishedScores("IllumiNeRF", 29.709, 0.947, 0.072, _ILLUMINERF, "16 A100 + TPUv5, 0.75 + 1 + 0.75 h"),
+    PublishedScores("IllumiNeRF, one GPU", 29.245, 0.946, 0.073, _ILLUMINERF, "A100 + TPUv5, 2 + 1 + 2 h"),
+    PublishedScores("Relightable 3D Gaussian", 29.05, 0.937, 0.080, _RELIGHTABLE_3DGS),
+    PublishedScores("TensoIR", 28.580, 0.944, 0.081, _ILLUMINERF, "RTX 2080 Ti, 5 h"),
+    PublishedScores("Neural Gaffer", 27.30, 0.918, 0.122, _RELIGHTABLE_3DGS),
+    PublishedScores("Neural-PBIR", 27.09, 0.925, 0.085, _RELIGHTABLE_3DGS),
+    PublishedScores("InvRender", 23.973, 0.901, 0.101, _ILLUMINERF, "RTX 2080 Ti, 15 h"),
+    PublishedScores("NeRFactor", 23.383, 0.908, 0.131, _ILLUMINERF, "RTX 2080 Ti, > 100 h"),
+)
+
+STANFORD_ORB = (
+    PublishedOrbScores("DiffReg-PBIR", 27.22, 34.98, 0.981, 0.021, "reported by later work on Stanford-ORB"),
+    PublishedOrbScores("ROGR", 26.21, 32.91, 0.980, 0.027, _ROGR),
+    PublishedOrbScores("Neural-PBIR", 26.01, 33.26, 0.979, 0.023, _ILLUMINERF),
+    PublishedOrbScores("IllumiNeRF, one GPU", 25.56, 32.74, 0.976, 0.027, _ILLUMINERF),
+    PublishedOrbScores("IllumiNeRF", 25.42, 32.62, 0.976, 0.027, _ILLUMINERF),
+    PublishedOrbScores("NVDiffRecMC", 24.43, 31.60, 0.972, 0.036, _ILLUMINERF),
+    PublishedOrbScores("InvRender", 23.76, 30.83, 0.970, 0.046, _ILLUMINERF),
+    PublishedOrbScores("NeRFactor", 23.54, 30.38, 0.969, 0.048, _ILLUMINERF),
+    PublishedOrbScores("NeRD", 23.29, 29.65, 0.957, 0.059, _ILLUMINERF),
+    PublishedOrbScores("NVDiffRec", 22.91, 29.72, 0.963, 0.039, _ILLUMINERF),
+    PublishedOrbScores("PhySG", 21.81, 28.11, 0.960, 0.055, _ILLUMINERF),
+)
+
+
+@dataclass(frozen=True)
+class GalleryScores:
+    """PSNR in dB of one scene and light: frames of the paper's gallery videos under this rule, every 20th
+    view.
+    """
+
+    scene: str
+    light: str
+    paper: float
+    """The paper's renderings."""
+    tensoir: float
+    """TensoIR's renderings."""
+    input_light: float
+    """The true view under the input light, rescaled: what not relighting at all scores with perfect
+    geometry.
+    """
+
+
+GALLERY = (
+    GalleryScores("hotdog", "bridge", 27.28, 25.19, 24.65),
+    GalleryScores("hotdog", "city", 25.79, 25.34, 26.66),
+    GalleryScores("hotdog", "night", 29.73, 31.70, 25.96),
+    GalleryScores("lego", "bridge", 26.74, 27.34, 23.38),
+    GalleryScores("lego", "city", 27.33, 23.24, 26.02),
+    GalleryScores("lego", "night", 29.49, 29.97, 24.54),
+)
+
+
+def gallery_scores(scene: str, light: str) -> GalleryScores | None:
+    """The gallery's figures for one scene and light, where there are any."""
+    return next((row for row in GALLERY if (row.scene, row.light) == (scene, light)), None)

@@ -1,0 +1,66 @@
+"""Score tables for a terminal: ours first, published figures marked as such."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from rich.table import Table
+
+from illuminerf.evaluation.published import TENSOIR, GalleryScores, gallery_scores
+
+PerLight = Mapping[str, Mapping[str, float]]
+"""[scene][light]"""
+
+
+def mean_of(cells: PerLight) -> float:
+    """Mean over lights, then over scenes."""
+    return float(np.mean([np.mean(list(lights.values())) for lights in cells.values()]))
+
+
+def cell_table(psnr: PerLight, ssim: PerLight, lpips: PerLight | None = None) -> Table:
+    """One row per scene and light, beside the PSNR of the gallery's renderings where they are known, and
+    the mean.
+    """
+    table = Table(title="Relighting, per scene and light (gallery: published renderings under the same rule)")
+    for heading in ("scene", "light"):
+        table.add_column(heading)
+    for heading in ("PSNR", "SSIM", "LPIPS", "paper", "TensoIR", "input light"):
+        table.add_column(heading, justify="right")
+    known: list[GalleryScores] = []
+    for scene, lights in psnr.items():
+        for light, value in lights.items():
+            gallery = gallery_scores(scene, light)
+            known += [gallery] if gallery else []
+            beside = [gallery.paper, gallery.tensoir, gallery.input_light] if gallery else [None] * 3
+            distance = lpips[scene][light] if lpips else None
+            table.add_row(scene, light, *_numbers([value], 2), *_numbers([ssim[scene][light], distance], 3),
+                          *_numbers(beside, 2))  # fmt: skip
+    complete = len(known) == sum(map(len, psnr.values()))
+    columns = [[row.paper for row in known], [row.tensoir for row in known], [row.input_light for row in known]]
+    table.add_section()
+    table.add_row(
+        "mean",
+        "",
+        *_numbers([mean_of(psnr)], 2),
+        *_numbers([mean_of(ssim), mean_of(lpips) if lpips else None], 3),
+        *_numbers([float(np.mean(column)) if complete else None for column in columns], 2),
+    )
+    return table
+
+
+def published_table(psnr: float, ssim: float, lpips: float | None, covers: str) -> Table:
+    """Our means, over what `covers` says, above the published rows of the whole TensoIR benchmark."""
+    table = Table(title="TensoIR benchmark: rows marked * are published figures for all 4 scenes and 5 lights")
+    table.add_column("method")
+    for heading in ("PSNR", "SSIM", "LPIPS"):
+        table.add_column(heading, justify="right")
+    table.add_column("source")
+    table.add_row(f"ours ({covers})", *_numbers([psnr], 2), *_numbers([ssim, lpips], 3), "this run")
+    table.add_section()
+    for row in TENSOIR:
+        note = f"{row.source}; {row.note}" if row.note else row.source
+        table.add_row(f"{row.method} *", *_numbers([row.psnr], 2), *_numbers([row.ssim, row.lpips], 3), note)
+    return table
+
+
+def _numbers(values: Sequence[float | None], digits: int) -> list[str]:
+    return ["-" if value is None else f"{value:.{digits}f}" for value in values]
