@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from illuminerf.data.capture import load_capture
 from illuminerf.presets import Preset
 from illuminerf.report import write_report
+from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import composite, read_png
 from illuminerf.scene.video import write_mp4
@@ -34,7 +34,7 @@ from illuminerf.stages import (
     render_radiance_cues,
 )
 from illuminerf.workflow.artefact import read_metrics
-from illuminerf.workflow.atomic import atomic_path, write_json
+from illuminerf.workflow.atomic import atomic_path, read_json, write_json
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say
 
@@ -75,8 +75,9 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
         folder = out / "lights" / job.name
         made = lights[job.name] = relight_under(capture, geometry, job.light, preset, folder)
         if job.test_cameras is not None:
+            cameras = _in_unit_ball(job.test_cameras, capture, folder / "test_cameras.json")
             made["test_views"] = render_novel_views.run(
-                made["latent_nerf"], dataclasses.replace(preset.test_views, cameras=job.test_cameras), folder / "test_views"
+                made["latent_nerf"], dataclasses.replace(preset.test_views, cameras=cameras), folder / "test_views"
             )
         if job.test_cameras is not None and job.truth is not None:
             made["scores"] = evaluate_relighting.run(
@@ -126,6 +127,13 @@ def _check(jobs: Sequence[LightJob]) -> None:
         raise UserError("two lights have the same name", got=", ".join(names), fix="rename one of the files")
     for job in jobs:
         EnvironmentMap.load(job.light)
+
+
+def _in_unit_ball(cameras: Path, capture: Path, out: Path) -> Path:
+    """Write cameras of the caller's world as cameras of the capture's unit ball."""
+    moved = load_capture(capture).unit_ball_cameras(Cameras.from_dict(read_json(cameras)))
+    write_json(out, moved.to_dict())
+    return out
 
 
 def _copy(source: Path, target: Path) -> None:

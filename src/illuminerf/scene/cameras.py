@@ -194,6 +194,24 @@ def sphere_cameras(
     return _cameras_at(positions, fov_radians, height, width)
 
 
+def spiral_cameras(
+    num_views: int,
+    radius: float,
+    fov_radians: float,
+    height: int,
+    width: int,
+    min_elevation_radians: float,
+    max_elevation_radians: float,
+) -> Cameras:
+    """Cameras that look at the origin from evenly spread places on a band of a sphere (a golden spiral)."""
+    low, high = np.sin(min_elevation_radians), np.sin(max_elevation_radians)
+    z = low + (high - low) * (np.arange(num_views) + 0.5) / num_views
+    azimuth = np.arange(num_views) * np.pi * (3 - np.sqrt(5))
+    ring = np.sqrt(1 - z**2)
+    positions = radius * np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], -1)
+    return _cameras_at(positions, fov_radians, height, width)
+
+
 def turntable_cameras(
     num_views: int,
     radius: float,

@@ -13,7 +13,7 @@ import numpy as np
 
 from illuminerf.cues.materials import Material
 from illuminerf.cues.shading import render_shaded
-from illuminerf.scene.cameras import Cameras, sphere_cameras
+from illuminerf.scene.cameras import Cameras, sphere_cameras, spiral_cameras
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import linear_from_srgb, write_png
 from illuminerf.scene.procedural import duck_still_life, evening_light, studio_light
@@ -23,6 +23,8 @@ from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.device import numpy_generator
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import track
+
+_RADIUS, _FOV_RADIANS = 3.4, float(np.radians(33))
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Config:
     """Views with truth under both lights."""
     size: int = 128
     """Pixels along each side."""
-    samples_per_pixel: int = 1024
+    samples_per_pixel: int = 256
     """Paths per pixel."""
     mesh_resolution: int = 160
     """Grid points per axis for the marching cubes of each object."""
@@ -57,13 +59,17 @@ def run(config: Config, out: Path) -> Path:
             for o in duck_still_life(config.mesh_resolution)
         ]
         studio, evening = studio_light(), evening_light()
-        photographed = _cameras(config.num_views, "photographs", config)
+        photographed = _photographed(config)
         _write(out, "images", photographed, parts, studio, config)
         write_json(out / "cameras.json", photographed.to_dict())
-        unseen = _cameras(config.num_test_views, "test", config)
-        write_json(out / "test" / "cameras.json", unseen.to_dict())
+        unseen = _unseen(config)
         for light in (studio, evening):
-            _write(out, f"test/{light.name}", unseen, parts, light, config)
+            folder = f"test/{light.name}"
+            _write(out, f"{folder}/images", unseen, parts, light, config)
+            write_json(out / folder / "cameras.json", unseen.to_dict())
+            names = [f"{view:03d}" for view in range(len(unseen))]
+            world = {"scale": 1.0, "offset": [0.0, 0.0, 0.0], "background": "masked", "names": names}
+            write_json(out / folder / "capture.json", world)
             light.save(out / "lights" / f"{light.name}.exr")
         artefact.finish({"views": config.num_views, "test_views": config.num_test_views})
     return out
@@ -75,17 +81,15 @@ def _vertex_colors(srgb: np.ndarray | None) -> np.ndarray:
     return srgb
 
 
-def _cameras(num_views: int, name: str, config: Config) -> Cameras:
-    return sphere_cameras(
-        num_views,
-        radius=3.4,
-        fov_radians=np.radians(33),
-        height=config.size,
-        width=config.size,
-        generator=numpy_generator(config.seed, "cameras", name),
-        min_elevation_radians=np.radians(8),
-        max_elevation_radians=np.radians(72),
-    )
+def _photographed(config: Config) -> Cameras:
+    band = (np.radians(8), np.radians(72))
+    return spiral_cameras(config.num_views, _RADIUS, _FOV_RADIANS, config.size, config.size, *band)
+
+
+def _unseen(config: Config) -> Cameras:
+    generator = numpy_generator(config.seed, "unseen views")
+    band = (np.radians(12), np.radians(60))
+    return sphere_cameras(config.num_test_views, _RADIUS, _FOV_RADIANS, config.size, config.size, generator, *band)
 
 
 def _write(

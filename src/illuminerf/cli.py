@@ -1,0 +1,196 @@
+"""The command line: one subcommand per stage, plus `relight` and `demo` that run them all."""
+
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from illuminerf import benchmark, demo, pipeline
+from illuminerf.presets import PRESETS, Preset, customised
+from illuminerf.stages import (
+    estimate_geometry,
+    evaluate_relighting,
+    fit_latent_nerf,
+    import_capture,
+    relight_views,
+    render_demo_capture,
+    render_novel_views,
+    render_radiance_cues,
+    render_training_pairs,
+    train_relighting_model,
+)
+from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.progress import console, say
+
+Positional = tyro.conf.Positional
+Folder = Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
+
+
+def relight_command(
+    capture: Positional[Path],
+    out: Path,
+    light: tyro.conf.UseAppendAction[tuple[Path, ...]],
+    preset: str = "embedded",
+    samples: int | None = None,
+    size: int | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    rotate: float = 0.0,
+    exposure: float = 0.0,
+    background: str | None = None,
+) -> None:
+    """Relight a capture: every stage of the method, from photographs to turntable, mesh and report.
+
+    Args:
+        capture: Folder of posed photographs (transforms.json, a TensoIR scene, or images/ + cameras.json).
+        out: Folder of the run; run the same command again to go on after an interruption.
+        light: Equirectangular .exr or .hdr map; repeat for several lights, geometry is estimated once.
+        preset: Settings of all stages: see `illuminerf presets`.
+        samples: Samples per photograph (S in the paper).
+        size: Longest side of the photographs in pixels; larger ones are averaged down.
+        seed: Of every random stream.
+        device: auto, cpu or cuda.
+        rotate: Turns the light about the vertical axis, in degrees, counter-clockwise seen from above.
+        exposure: Stops by which the light is made brighter.
+        background: Plain background to cut away where the photographs have no masks: white or black.
+    """
+    settings = customised(
+        preset, samples=samples, size=size, seed=seed, device=device, rotate_degrees=rotate, exposure_stops=exposure,
+        background=background,
+    )  # fmt: skip
+    pipeline.relight(capture, [pipeline.LightJob(path) for path in light], settings, out)
+    say(f"done: {out / 'report.html'}, {out / 'turntable.mp4'}, {out / 'mesh.glb'}")
+
+
+def demo_command(out: Path = Path("runs/demo"), device: str = "auto", seed: int = 0) -> None:
+    """Relight the capture that ships with the package and score the result.
+
+    Args:
+        out: Folder of the run.
+        device: auto, cpu or cuda.
+        seed: Of every random stream.
+    """
+    demo.run(out, customised("demo", device=device, seed=seed))
+
+
+def presets_command() -> None:
+    """List the presets: what each is for and what it costs."""
+    for preset in PRESETS.values():
+        say(f"[bold]{preset.name}[/bold]: {preset.description}")
+
+
+def _stage(run: Callable[..., Path], config: type, description: str, inputs: dict[str, Any]) -> Callable[..., None]:
+    """A subcommand of one stage: its inputs as positional arguments, its config's fields as options, and --out."""
+
+    def command(*arguments: Any, **options: Any) -> None:
+        run(*(options[name] for name in inputs), options["config"], options["out"])
+        say(f"done: {options['out']}")
+
+    command.__doc__ = description
+    parameters = {name: Positional[kind] for name, kind in inputs.items()}
+    command.__annotations__ = {**parameters, "out": Path, "config": tyro.conf.OmitArgPrefixes[config]}  # type: ignore[valid-type]
+    import inspect
+
+    command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [
+            inspect.Parameter(
+                name,
+                inspect.Parameter.KEYWORD_ONLY,
+                annotation=kind,
+                default=config() if name == "config" else inspect.Parameter.empty,
+            )
+            for name, kind in command.__annotations__.items()
+        ]
+    )
+    return command
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "relight": relight_command,
+    "demo": demo_command,
+    "presets": presets_command,
+    "import-capture": _stage(
+        import_capture.run,
+        import_capture.Config,
+        "Read a folder of posed photographs into a capture.",
+        {"source": Path},
+    ),
+    "estimate-geometry": _stage(
+        estimate_geometry.run, estimate_geometry.Config, "Fit the surface field to a capture.", {"capture": Path}
+    ),
+    "render-radiance-cues": _stage(
+        render_radiance_cues.run,
+        render_radiance_cues.Config,
+        "Path trace the geometry with the four cue materials under a light.",
+        {"geometry": Path, "capture": Path, "light": Path},
+    ),
+    "relight-views": _stage(
+        relight_views.run,
+        relight_views.Config,
+        "Draw relit samples of every photograph; the model is a folder, or the word embedded.",
+        {"capture": Path, "cues": Path, "model": str},
+    ),
+    "fit-latent-nerf": _stage(
+        fit_latent_nerf.run,
+        fit_latent_nerf.Config,
+        "Distil all relit samples into one latent NeRF on the estimated geometry.",
+        {"geometry": Path, "capture": Path, "relit": Path},
+    ),
+    "render-novel-views": _stage(
+        render_novel_views.run,
+        render_novel_views.Config,
+        "Render a latent NeRF (or a geometry's own appearance) from a turntable or given cameras.",
+        {"field": Path},
+    ),
+    "evaluate-relighting": _stage(
+        evaluate_relighting.run,
+        evaluate_relighting.Config,
+        "Score rendered views against the truth by the TensoIR rule.",
+        {"novel_views": Path, "truth": Path},
+    ),
+    "render-training-pairs": _stage(
+        render_training_pairs.run,
+        render_training_pairs.Config,
+        "Render objects under several lights, with cues: what the relighting model learns from.",
+        {"objects": Path, "lights": Path},
+    ),
+    "train-rdm": _stage(
+        train_relighting_model.run,
+        train_relighting_model.Config,
+        "Train a relighting diffusion model on rendered pairs.",
+        {"pairs": Path, "heldout": Path},
+    ),
+    "render-demo-capture": _stage(
+        render_demo_capture.run, render_demo_capture.Config, "Render the bundled demo capture from its formulas.", {}
+    ),
+}
+GROUPS: dict[str, dict[str, Callable[..., None]]] = {"benchmark": {"tensoir": benchmark.tensoir_command}}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point: exit status 0, 2 for what the user can mend, 130 for Ctrl-C."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    warnings.showwarning = lambda message, *_: say(f"[yellow]warning:[/yellow] {message}")
+    try:
+        if arguments[:1] and arguments[0] in GROUPS:
+            group = arguments[0]
+            tyro.extras.subcommand_cli_from_dict(GROUPS[group], prog=f"illuminerf {group}", args=arguments[1:])
+        else:
+            tyro.extras.subcommand_cli_from_dict(
+                COMMANDS,
+                prog="illuminerf",
+                description="Relight photographed objects. Also: illuminerf benchmark tensoir --help",
+                args=arguments,
+            )
+    except UserError as error:
+        console.print(f"[bold red]error:[/bold red] {error}", highlight=False, markup=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        say("stopped; run the same command again to go on")
+        sys.exit(130)
+
+
+__all__ = ["COMMANDS", "GROUPS", "Preset", "main"]
