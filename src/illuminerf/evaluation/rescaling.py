@@ -18,13 +18,11 @@ MaskedPixels = Iterable[tuple[np.ndarray, np.ndarray]]
 def median_ratio(views: MaskedPixels) -> np.ndarray:
     """float64 [3]: the median over all pixels of truth / clip(prediction, EPSILON, 1), per channel.
 
-    One float32 per masked pixel and channel is kept; the median is exact. Without any pixel the factors are
+    One float64 per masked pixel and channel is kept: 8-bit values make exact quotients, and
+    the cut to 8 bits afterwards shows a factor's last bits. Without any pixel the factors are
     1.
     """
-    ratios = [
-        np.divide(truth, np.clip(prediction, EPSILON, 1), dtype=np.float64).astype(np.float32)
-        for truth, prediction in views
-    ]
+    ratios = [np.divide(truth, np.clip(prediction, EPSILON, 1), dtype=np.float64) for truth, prediction in views]
     if not sum(len(ratio) for ratio in ratios):
         return np.ones(3)
     return np.array([np.median(np.concatenate([ratio[:, i] for ratio in ratios])) for i in range(3)], np.float64)

@@ -11,13 +11,13 @@ from typing import Any, overload
 import numpy as np
 import torch
 
-from illuminerf.data.tensoir import find_views, load_test_image
+from illuminerf.data.tensoir import INPUT_LIGHT, TensoirView, find_views, load_test_image
 from illuminerf.evaluation.benchmark_rule import LightScores, Rescale, ViewPair, score_light, view_pair
-from illuminerf.evaluation.metrics import ImageMetric, lpips_vgg
+from illuminerf.evaluation.metrics import LPIPS_ABSENT, ImageMetric, lpips_vgg
 from illuminerf.evaluation.tables import mean_of
 from illuminerf.scene.images import read_png
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import track
+from illuminerf.workflow.progress import say, track
 
 SCALE_EVERY = 10
 """The benchmark takes its factors from every 10th of its 200 views."""
@@ -26,8 +26,8 @@ SCALE_EVERY = 10
 class PairsOnDisk(Sequence[ViewPair]):
     """The views of one scene and light, each read when it is asked for."""
 
-    def __init__(self, scene: Path, predictions: Path, light: str, names: Sequence[str]) -> None:
-        self.scene, self.predictions, self.light, self.names = scene, predictions, light, names
+    def __init__(self, scene: Path, light: str, names: Sequence[str], predictions: Sequence[Path]) -> None:
+        self.scene, self.light, self.names, self.predictions = scene, light, names, predictions
 
     def __len__(self) -> int:
         return len(self.names)
@@ -38,8 +38,8 @@ class PairsOnDisk(Sequence[ViewPair]):
     def __getitem__(self, index: slice) -> "PairsOnDisk": ...
     def __getitem__(self, index: int | slice) -> "ViewPair | PairsOnDisk":
         if isinstance(index, slice):
-            return PairsOnDisk(self.scene, self.predictions, self.light, self.names[index])
-        path = self.predictions / f"{self.names[index]}.png"
+            return PairsOnDisk(self.scene, self.light, self.names[index], self.predictions[index])
+        path = self.predictions[index]
         prediction = read_png(path)
         truth = load_test_image(self.scene, self.names[index], self.light)
         if prediction.shape[:2] != truth.shape[:2]:
@@ -69,22 +69,61 @@ def score_predictions(
 
     Raises UserError where a scene, a light or all predictions of one are missing, or where sizes differ.
     """
+    cells = _cells(scenes, lights, every)
+    plans = [_predicted(root, predictions, scene, light, every) for scene, light in cells]
+    return _scored(cells, plans, rescale, with_lpips)
+
+
+def score_input_light(
+    root: Path,
+    scenes: Sequence[str],
+    lights: Sequence[str],
+    rescale: Rescale = "median",
+    every: int = 1,
+    with_lpips: bool = False,
+    input_light: str = INPUT_LIGHT,
+) -> dict[str, Any]:
+    """The scores of not relighting: the true test views under the input light stand in for every target
+    light.
+
+    Geometry is perfect and only the light is wrong, so a method that scores less does not relight. Same
+    result as `score_predictions`, same errors.
+    """
+    cells = _cells(scenes, lights, every)
+    plans = []
+    for scene, light in cells:
+        views = _with_truth(root, scene, light, every)
+        paths = [view.image(input_light) for view in views]
+        plans.append(PairsOnDisk(root / scene, light, [view.name for view in views], paths))
+    return _scored(cells, plans, rescale, with_lpips)
+
+
+def _cells(scenes: Sequence[str], lights: Sequence[str], every: int) -> list[tuple[str, str]]:
     if every < 1:
         raise UserError("every must be positive", got=str(every), wanted="1, 2, 3, ...")
     if not scenes or not lights:
         raise UserError("nothing to score", got=f"scenes {list(scenes)}, lights {list(lights)}", wanted="one or more")
-    lpips = lpips_vgg(torch.device("cpu")) if with_lpips else None
-    cells = [(scene, light) for scene in scenes for light in lights]
-    plans = [_pairs(root, predictions, scene, light, every) for scene, light in cells]  # all checked before any work
-    scored = [_score(pairs, rescale, lpips) for pairs in track(plans, "score")]
-    return _as_json(cells, scored, rescale)
+    return [(scene, light) for scene in scenes for light in lights]
 
 
-def _pairs(root: Path, predictions: Path, scene: str, light: str, every: int) -> PairsOnDisk:
+def _with_truth(root: Path, scene: str, light: str, every: int) -> list[TensoirView]:
     if not (root / scene).is_dir():
         raise UserError(
             f"the benchmark has no scene {scene!r}", got=f"no folder {root / scene}", wanted="a scene folder"
         )
+    views = [view for view in find_views(root / scene, "test", every) if light in view.lights()]
+    if not views:
+        raise UserError(
+            f"the benchmark has no truth for {scene} under {light}",
+            got=f"no test_*/rgba_{light}.png in {root / scene}",
+            wanted="the true test views",
+            fix="unpack this light, or leave it out",
+        )
+    return views
+
+
+def _predicted(root: Path, predictions: Path, scene: str, light: str, every: int) -> PairsOnDisk:
+    views = _with_truth(root, scene, light, every)
     folder = predictions / scene / light
     if not folder.is_dir():
         raise UserError(
@@ -93,23 +132,25 @@ def _pairs(root: Path, predictions: Path, scene: str, light: str, every: int) ->
             wanted=f"{predictions.name}/{scene}/{light}/test_000.png, ...",
             fix="render this light, or leave it out",
         )
-    with_truth = [view for view in find_views(root / scene, "test", every) if light in view.lights()]
-    if not with_truth:
-        raise UserError(
-            f"the benchmark has no truth for {scene} under {light}",
-            got=f"no test_*/rgba_{light}.png in {root / scene}",
-            wanted="the true test views",
-            fix="unpack this light, or leave it out",
-        )
-    names = [view.name for view in with_truth if (folder / f"{view.name}.png").is_file()]
+    names = [view.name for view in views if (folder / f"{view.name}.png").is_file()]
     if not names:
         raise UserError(
             f"no test view of {scene} under {light} has a prediction",
-            got=f"no {with_truth[0].name}.png or any other of {len(with_truth)} views in {folder}",
+            got=f"no {views[0].name}.png or any other of {len(views)} views in {folder}",
             wanted="predictions named like the benchmark's test views",
             fix="name the images test_<number>.png",
         )
-    return PairsOnDisk(root / scene, folder, light, names)
+    return PairsOnDisk(root / scene, light, names, [folder / f"{name}.png" for name in names])
+
+
+def _scored(
+    cells: list[tuple[str, str]], plans: list[PairsOnDisk], rescale: Rescale, with_lpips: bool
+) -> dict[str, Any]:
+    lpips = lpips_vgg(torch.device("cpu")) if with_lpips else None
+    if with_lpips and lpips is None:
+        say(LPIPS_ABSENT)
+    scores = [_score(pairs, rescale, lpips) for pairs in track(plans, "score")]
+    return _as_json(cells, scores, rescale)
 
 
 def _score(pairs: PairsOnDisk, rescale: Rescale, lpips: ImageMetric | None) -> LightScores:
