@@ -1,0 +1,149 @@
+"""Multi-resolution hash grid (Mueller et al. 2022) with its spatial Jacobian.
+
+Features and Jacobian are both linear in the table, so a signed distance built on them has normals in forward mode,
+and losses on those normals train with ordinary first-order autograd: no double backward through positions.
+`interpolate` is the readable version and runs everywhere; on a CPU `HashGrid` uses the numba twin.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from illuminerf.fields.hash_grid_kernel import KernelInterpolation, kernel_layout
+from illuminerf.workflow.errors import UserError
+
+_PRIMES = (1, 2654435761, 805459861)
+
+
+@dataclass(frozen=True)
+class HashGridConfig:
+    """Sizes of one hash grid over the box [-1, 1]^3."""
+
+    num_levels: int = 10
+    """Number of resolutions, spaced geometrically."""
+    num_features: int = 2
+    """Features per entry and level."""
+    log2_entries: int = 16
+    """Entries per level are at most 2 to this power; coarse levels that fit are stored densely."""
+    coarsest: int = 16
+    """Cells per axis of the first level."""
+    finest: int = 512
+    """Cells per axis of the last level."""
+
+    def __post_init__(self) -> None:
+        if self.num_levels < 1 or self.num_features < 1 or not 4 <= self.log2_entries <= 24:
+            raise UserError("a hash grid needs levels, features and 2^4 to 2^24 entries", got=str(self))
+        if not 1 <= self.coarsest <= self.finest:
+            raise UserError(
+                "hash grid resolutions must grow", got=f"{self.coarsest} to {self.finest}", wanted="1 <= coarsest"
+            )
+
+    def resolutions(self) -> list[int]:
+        """Cells per axis of each level."""
+        if self.num_levels == 1:
+            return [self.coarsest]
+        ratio = (self.finest / self.coarsest) ** (1 / (self.num_levels - 1))
+        return [round(self.coarsest * ratio**level) for level in range(self.num_levels)]
+
+    @property
+    def width(self) -> int:
+        """Length of a feature vector."""
+        return self.num_levels * self.num_features
+
+
+class HashGrid(nn.Module):
+    """A table of features with trilinear interpolation.
+
+    Positions are [points, 3]; outside the box [-1, 1]^3 they are clamped to it. Positions get no gradient.
+    """
+
+    def __init__(self, config: HashGridConfig, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self._resolutions = config.resolutions()
+        limit = 2**config.log2_entries
+        self._sizes = [min((r + 1) ** 3, limit) for r in self._resolutions]
+        self._offsets = [sum(self._sizes[:level]) for level in range(config.num_levels)]
+        self._layout = kernel_layout(self._resolutions, self._sizes, self._offsets)
+        table = torch.rand(sum(self._sizes), config.num_features, generator=generator)
+        self.table = nn.Parameter((table * 2 - 1) * 1e-4)
+
+    def forward(
+        self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
+    ) -> Float[Tensor, "points width"]:
+        """Features, each level times its weight (coarse to fine)."""
+        if positions.is_cuda or not len(positions):
+            features, _ = interpolate(positions, self.table, self._resolutions, self._sizes, self._offsets)
+        else:
+            features, _ = KernelInterpolation.apply(self.table, positions, self._layout, False)
+        return features if level_weights is None else features * self._columns(level_weights)
+
+    def with_jacobian(
+        self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
+    ) -> tuple[Float[Tensor, "points width"], Float[Tensor, "points width 3"]]:
+        """Features and their derivatives with respect to the position."""
+        if positions.is_cuda or not len(positions):
+            features, jacobian = interpolate(
+                positions, self.table, self._resolutions, self._sizes, self._offsets, with_jacobian=True
+            )
+        else:
+            features, jacobian = KernelInterpolation.apply(self.table, positions, self._layout, True)
+        if level_weights is None:
+            return features, jacobian
+        columns = self._columns(level_weights)
+        return features * columns, jacobian * columns[:, None]
+
+    def _columns(self, level_weights: Tensor) -> Tensor:
+        return level_weights.to(self.table).repeat_interleave(self.config.num_features)
+
+
+def interpolate(
+    positions: Float[Tensor, "points 3"],
+    table: Float[Tensor, "entries features"],
+    resolutions: list[int],
+    sizes: list[int],
+    offsets: list[int],
+    with_jacobian: bool = False,
+) -> tuple[Float[Tensor, "points width"], Float[Tensor, "..."]]:
+    """Readable twin of the kernel: features [points, levels * features] and Jacobian [points, .., 3] (or empty).
+
+    Differentiable in the table and, almost everywhere, in the positions.
+    """
+    features, jacobians = [], []
+    corners = torch.tensor([[c & 1, (c >> 1) & 1, c >> 2] for c in range(8)], device=positions.device)
+    for resolution, size, offset in zip(resolutions, sizes, offsets, strict=True):
+        half = resolution / 2
+        scaled = (positions.to(table.dtype) * half + half).clamp(0, resolution)
+        cell = scaled.detach().long().clamp_max(resolution - 1)
+        inside = (scaled - cell)[:, None]
+        axis_weights = torch.where(corners.bool(), inside, 1 - inside)
+        values = table[offset + _entries(cell[:, None] + corners, resolution, size)]
+        features.append((axis_weights.prod(-1, keepdim=True) * values).sum(1))
+        if with_jacobian:
+            wx, wy, wz = axis_weights.unbind(-1)
+            slopes = torch.stack([wy * wz, wx * wz, wx * wy], -1) * (corners * 2 - 1) * half
+            jacobians.append(torch.einsum("nci,ncf->nfi", slopes, values))
+    jacobian = torch.cat(jacobians, 1) if with_jacobian else table.new_empty(0)
+    return torch.cat(features, -1), jacobian
+
+
+def _entries(corner: Tensor, resolution: int, size: int) -> Tensor:
+    x, y, z = corner.unbind(-1)
+    side = resolution + 1
+    if side**3 <= size:
+        return x + side * (y + side * z)
+    return (x * _PRIMES[0] ^ y * _PRIMES[1] ^ z * _PRIMES[2]) & (size - 1)
+
+
+def coarse_to_fine_weights(
+    num_levels: int, progress: float, first_levels: int, device: torch.device | str = "cpu"
+) -> Float[Tensor, " levels"]:
+    """Weight of each level as training goes: `first_levels` are on at progress 0, all at progress 1 and after.
+
+    Args:
+        progress: share of the coarse-to-fine phase that is over.
+    """
+    active = first_levels + min(max(progress, 0.0), 1.0) * (num_levels - first_levels)
+    return (active - torch.arange(num_levels, device=device, dtype=torch.float32)).clamp(0, 1)

@@ -1,0 +1,70 @@
+"""Whole images of a fitted field, in chunks."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from illuminerf.fields.bounds import OccupiedCells
+from illuminerf.fields.radiance_field import RadianceField
+from illuminerf.fields.ray_pool import pixel_rays
+from illuminerf.scene.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class RenderedImage:
+    """One view.
+
+    Attributes:
+        srgb: float32 [height, width, 3], premultiplied on black.
+        alpha: float32 [height, width].
+        normals: float32 [height, width, 3], predicted normals in the world, weighted (length is about alpha).
+        depth: float32 [height, width], expected distance along the ray times alpha.
+    """
+
+    srgb: np.ndarray
+    alpha: np.ndarray
+    normals: np.ndarray
+    depth: np.ndarray
+
+
+@torch.no_grad()
+def render_image(
+    field: RadianceField,
+    cells: OccupiedCells,
+    cameras: Cameras,
+    view: int,
+    latent: Float[Tensor, " latent"] | None = None,
+    chunk: int = 8192,
+) -> RenderedImage:
+    """Render one view; pixels whose rays miss the occupied cells are transparent.
+
+    Args:
+        latent: latent code; None stands for the zero code.
+        chunk: rays at a time.
+    """
+    device = cells.cells.device
+    num_pixels = cameras.height * cameras.width
+    result = torch.zeros(num_pixels, 8, device=device)
+    for pixel in torch.arange(num_pixels, device=device).split(chunk):
+        index = torch.full_like(pixel, view)
+        origins, directions = pixel_rays(cameras, index, pixel)
+        near, far = cells.clip(origins, directions)
+        hit = (far > near).nonzero()[:, 0]
+        if not len(hit):
+            continue
+        origins, directions = origins[hit], directions[hit]
+        samples = field.sample(origins, directions, near[hit], far[hit])
+        points = field.worth_shading(samples)
+        predicted, shading = field.shading_normals(points)
+        latents = None if latent is None else latent.to(device).expand(len(hit), -1)
+        srgb = field.shade(points, shading, directions, latents)
+        normals = torch.zeros_like(srgb).index_add(0, points.ray, points.weights[:, None] * predicted)
+        distance = 0.5 * (samples.edges[:, 1:] + samples.edges[:, :-1])
+        alpha = samples.weights.sum(-1, keepdim=True).clamp(0, 1)
+        depth = (samples.weights * distance).sum(-1, keepdim=True)
+        result[pixel[hit]] = torch.cat([srgb, alpha, normals, depth], -1)
+    image = result.view(cameras.height, cameras.width, 8).cpu().numpy()
+    return RenderedImage(image[..., :3], image[..., 3], image[..., 4:7], image[..., 7])

@@ -1,0 +1,71 @@
+"""From the signed distance to a triangle mesh with predicted normals."""
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+
+from illuminerf.fields.bounds import OccupiedCells
+from illuminerf.fields.surface import SurfaceField
+from illuminerf.scene.meshes import TriangleMesh
+from illuminerf.workflow.errors import UserError
+
+_CHUNK = 1 << 17
+
+
+@torch.no_grad()
+def extract_mesh(
+    surface: SurfaceField, cells: OccupiedCells, resolution: int, min_component_share: float = 0.01
+) -> TriangleMesh:
+    """Marching cubes at zero, with predicted normals as vertex normals.
+
+    Args:
+        surface: the fitted surface.
+        cells: the distance is evaluated in these cells only; elsewhere it counts as outside.
+        resolution: points per axis over the box of the occupied cells.
+        min_component_share: connected components smaller than this share of the largest one's area are dropped.
+
+    Raises:
+        UserError: the distance has no zero crossing.
+    """
+    side = cells.cells.shape[0]
+    device = cells.cells.device
+    occupied = cells.cells.nonzero()
+    low = (occupied.min(0).values - 1).cpu().numpy() * (2 / side) - 1
+    high = (occupied.max(0).values + 2).cpu().numpy() * (2 / side) - 1
+    spacing = float((high - low).max()) / (resolution - 1)
+    axes = [torch.arange(low[i], high[i] + spacing, spacing, device=device, dtype=torch.float32) for i in range(3)]
+    shape = tuple(len(axis) for axis in axes)
+    distance = torch.full((shape[0] * shape[1] * shape[2],), spacing, device=device)
+    for chunk in torch.arange(len(distance), device=device).split(_CHUNK):
+        index = (chunk // (shape[1] * shape[2]), chunk // shape[2] % shape[1], chunk % shape[2])
+        positions = torch.stack([axis[i] for axis, i in zip(axes, index, strict=True)], -1)
+        inside = cells.contains(positions) & (positions.norm(dim=-1) < 1)
+        distance[chunk[inside]] = surface.signed_distance(positions[inside])
+    volume = distance.view(shape).cpu().numpy()
+    if volume.min() >= 0 or volume.max() <= 0:
+        raise UserError(
+            "the fitted surface is empty: its signed distance has no zero crossing",
+            fix="check masks and cameras, or fit for more steps",
+        )
+    # the volume is positive outside and marching_cubes orients faces by its gradient
+    vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(spacing,) * 3, gradient_direction="ascent")
+    vertices, faces = _large_components(vertices + low, faces, min_component_share)
+    positions = torch.from_numpy(vertices.astype(np.float32)).to(device)
+    normals = torch.cat([surface.predicted_normals(chunk) for chunk in positions.split(_CHUNK)])
+    return TriangleMesh(positions.cpu().numpy(), faces.astype(np.int32), normals.cpu().numpy())
+
+
+def _large_components(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Drop components whose area is below a share of the largest one's, and vertices no face uses."""
+    first = np.concatenate([faces[:, 0], faces[:, 1]])
+    second = np.concatenate([faces[:, 1], faces[:, 2]])
+    links = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(len(vertices),) * 2)
+    count, label = connected_components(links, directed=False)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
+    area_of = np.bincount(label[faces[:, 0]], area, minlength=count)
+    faces = faces[area_of[label[faces[:, 0]]] >= min_share * area_of.max()]
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return vertices[used], renumbered.reshape(-1, 3)

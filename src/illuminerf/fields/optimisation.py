@@ -1,0 +1,104 @@
+"""Adam as the paper sets it, and a loop that can be killed at any time and goes on to the same bytes."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from illuminerf.workflow.checkpoint import (
+    load_checkpoint,
+    optimizer_tensors,
+    restore_optimizer,
+    save_checkpoint,
+)
+from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.progress import step_progress
+
+
+@dataclass(frozen=True)
+class OptimiserConfig:
+    """Adam (beta 0.9 and 0.99, epsilon 1e-15) with a logarithmic decay; supplement A.1."""
+
+    num_steps: int = 1500
+    """Steps (25 000 in the paper)."""
+    rays_per_step: int = 512
+    """Rays in a batch (2^13 in the paper preset)."""
+    first_learning_rate: float = 5e-3
+    """Learning rate after the warm-up (the paper's 5e-3)."""
+    last_learning_rate: float = 5e-4
+    """Learning rate of the last step (the paper's 5e-4)."""
+    warmup_steps: int = 30
+    """Steps of the cosine warm-up (500 of 25 000 in the paper)."""
+    checkpoint_every: int = 500
+    """Steps between checkpoints."""
+
+    def __post_init__(self) -> None:
+        if min(self.num_steps, self.rays_per_step, self.checkpoint_every) < 1 or self.warmup_steps < 0:
+            raise UserError("steps, rays per step and checkpoint interval must be positive", got=str(self))
+        if not 0 < self.last_learning_rate <= self.first_learning_rate:
+            raise UserError("the learning rate must decay to a positive value", got=str(self))
+
+    @classmethod
+    def paper(cls) -> "OptimiserConfig":
+        """25 000 steps of 2^13 rays with 500 steps of warm-up."""
+        return cls(num_steps=25_000, rays_per_step=8192, warmup_steps=500, checkpoint_every=1000)
+
+    def learning_rate(self, step: int) -> float:
+        """Log-linear decay times the cosine warm-up, at a step counted from 0."""
+        share = step / max(self.num_steps - 1, 1)
+        decayed = self.first_learning_rate * (self.last_learning_rate / self.first_learning_rate) ** share
+        if step >= self.warmup_steps:
+            return decayed
+        return decayed * 0.5 * (1 - math.cos(math.pi * (step + 1) / (self.warmup_steps + 1)))
+
+
+def fit(
+    module: nn.Module,
+    config: OptimiserConfig,
+    step_loss: Callable[[int], tuple[Tensor, dict[str, float]]],
+    checkpoint: Path,
+    description: str,
+    start: Callable[[], None] | None = None,
+) -> None:
+    """Minimise `step_loss` over the parameters of `module` that require a gradient.
+
+    Args:
+        step_loss: from the step to the loss and numbers to show. All randomness must derive from the step, which is
+            what makes a resumed fit equal to an uninterrupted one.
+        checkpoint: where state is kept; the caller deletes it when the artefact is whole.
+        start: called once before the first step, not on resume.
+    """
+    parameters = {name: p for name, p in module.named_parameters() if p.requires_grad}
+    optimiser = torch.optim.Adam(list(parameters.values()), betas=(0.9, 0.99), eps=1e-15, fused=True)
+    first = 0
+    if checkpoint.exists():
+        first = _restore(checkpoint, parameters, optimiser)
+    elif start is not None:
+        start()
+    with step_progress(description, config.num_steps, first) as progress:
+        for step in range(first, config.num_steps):
+            for group in optimiser.param_groups:
+                group["lr"] = config.learning_rate(step)
+            loss, numbers = step_loss(step)
+            if not math.isfinite(float(loss.detach())):
+                raise FloatingPointError(f"the loss is {float(loss.detach())} at step {step} of {description}")
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+            if (step + 1) % config.checkpoint_every == 0 and step + 1 < config.num_steps:
+                tensors = {f"parameter.{name}": p for name, p in parameters.items()}
+                save_checkpoint(checkpoint, tensors | optimizer_tensors(optimiser), {"step": step + 1})
+            progress.advance(1, **numbers)
+
+
+def _restore(checkpoint: Path, parameters: dict[str, nn.Parameter], optimiser: torch.optim.Optimizer) -> int:
+    device = next(iter(parameters.values())).device
+    tensors, metadata = load_checkpoint(checkpoint, device)
+    with torch.no_grad():
+        for name, parameter in parameters.items():
+            parameter.copy_(tensors[f"parameter.{name}"])
+    restore_optimizer(optimiser, tensors)
+    return int(metadata["step"])

@@ -1,0 +1,173 @@
+"""UniSDF put together: proposal, surface and appearance, rendered along rays."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional
+
+from illuminerf.fields.appearance import AppearanceConfig, AppearanceField, blend_radiance
+from illuminerf.fields.hash_grid import HashGridConfig
+from illuminerf.fields.proposal_sampling import ProposalConfig, ProposalField, resample_edges, uniform_edges
+from illuminerf.fields.surface import SurfaceConfig, SurfaceField
+from illuminerf.fields.volume_rendering import rendering_weights
+from illuminerf.workflow.errors import UserError
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """All sizes of one radiance field; the defaults are those of the embedded preset."""
+
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    """Signed distance and predicted normals."""
+    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
+    """Radiance fields and AffineGLO."""
+    proposal: ProposalConfig = field(default_factory=ProposalConfig)
+    """Proposal density."""
+    num_proposal_samples: int = 24
+    """Samples per ray of the proposal (64 in the paper)."""
+    num_samples: int = 16
+    """Samples per ray of the surface (64 for the paper preset)."""
+    min_weight: float = 1e-3
+    """Samples of smaller rendering weight are not shaded; 0 shades all."""
+    radiance_normals: Literal["predicted", "density"] = "predicted"
+    """Which normals the radiance fields see and reflect about."""
+
+    def __post_init__(self) -> None:
+        if min(self.num_proposal_samples, self.num_samples) < 2:
+            raise UserError("a ray needs at least two samples", got=str(self.num_samples))
+        if not 0 <= self.min_weight < 0.1:
+            raise UserError("min_weight must be in [0, 0.1)", got=str(self.min_weight))
+
+    @classmethod
+    def embedded(cls) -> "FieldConfig":
+        """For two CPU cores and images of about 200 x 200."""
+        return cls()
+
+    @classmethod
+    def paper(cls) -> "FieldConfig":
+        """The paper's sizes, where stated (supplement A.1); the rest follows camp_zipnerf."""
+        grid = HashGridConfig(num_levels=10, num_features=4, log2_entries=21, coarsest=16, finest=8192)
+        return cls(
+            surface=SurfaceConfig(
+                grid=grid,
+                hidden_width=64,
+                normal_grid=HashGridConfig(15, 4, 21, 32, 4096),
+                normal_hidden_width=64,
+                initial_beta=0.1,
+            ),
+            appearance=AppearanceConfig(
+                grid=grid,
+                bottleneck_width=256,
+                hidden_width=256,
+                num_hidden_layers=3,
+                num_direction_octaves=4,
+                latent_width=128,
+                latent_hidden_width=128,
+            ),
+            proposal=ProposalConfig(HashGridConfig(6, 2, 19, 16, 512), 64),
+            num_proposal_samples=64,
+            num_samples=64,
+            min_weight=0.0,
+        )
+
+
+@dataclass
+class RaySamples:
+    """Where rays were sampled and what the surface is there. Only `weights` and later carry surface gradients."""
+
+    edges: Float[Tensor, "rays edges"]
+    positions: Float[Tensor, "rays samples 3"]
+    weights: Float[Tensor, "rays samples"]
+    gradients: Float[Tensor, "rays samples 3"]
+    proposal_edges: Float[Tensor, "rays proposal_edges"]
+    proposal_weights: Float[Tensor, "rays proposal_samples"]
+
+
+@dataclass
+class ShadingPoints:
+    """Samples that are worth shading, those of all rays in one axis."""
+
+    ray: Int[Tensor, " points"]
+    positions: Float[Tensor, "points 3"]
+    weights: Float[Tensor, " points"]
+    density_normals: Float[Tensor, "points 3"]
+
+
+class RadianceField(nn.Module):
+    """Proposal, surface and appearance of one object in the unit ball."""
+
+    def __init__(self, config: FieldConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.proposal = ProposalField(config.proposal)
+        self.surface = SurfaceField(config.surface)
+        self.appearance = AppearanceField(config.appearance)
+
+    def sample(
+        self,
+        origins: Float[Tensor, "rays 3"],
+        directions: Float[Tensor, "rays 3"],
+        near: Float[Tensor, " rays"],
+        far: Float[Tensor, " rays"],
+        generator: torch.Generator | None = None,
+        level_weights: Float[Tensor, " levels"] | None = None,
+    ) -> RaySamples:
+        """Choose samples by the proposal, evaluate the surface at them and weigh them. A generator adds jitter."""
+        coarse = uniform_edges(near, far, self.config.num_proposal_samples, generator)
+        density = self.proposal(_middles(origins, directions, coarse).view(-1, 3)).view(len(near), -1)
+        proposal_weights = rendering_weights(density * (coarse[:, 1:] - coarse[:, :-1]))
+        edges = resample_edges(coarse, proposal_weights, self.config.num_samples, generator)
+        positions = _middles(origins, directions, edges)
+        point = self.surface(positions.view(-1, 3), level_weights)
+        weights = rendering_weights(self.surface.depths_along(point, directions, edges))
+        gradients = point.gradient.view_as(positions)
+        return RaySamples(edges, positions, weights, gradients, coarse, proposal_weights)
+
+    def worth_shading(self, samples: RaySamples) -> ShadingPoints:
+        """Samples above the configured weight.
+
+        Deviation: UniSDF shades all. A sample left out counts as black, and the gradient that its colour would send
+        to its (negligible) weight is dropped.
+        """
+        chosen = (samples.weights.detach() > self.config.min_weight).nonzero()
+        ray, sample = chosen.unbind(-1)
+        return ShadingPoints(
+            ray,
+            samples.positions[ray, sample],
+            samples.weights[ray, sample],
+            functional.normalize(samples.gradients[ray, sample], dim=-1, eps=1e-6),
+        )
+
+    def shade(
+        self,
+        points: ShadingPoints,
+        normals: Float[Tensor, "points 3"],
+        directions: Float[Tensor, "rays 3"],
+        latents: Float[Tensor, "rays latent"] | None = None,
+        level_weights: Float[Tensor, " levels"] | None = None,
+    ) -> Float[Tensor, "rays 3"]:
+        """Colour of rays: sRGB premultiplied on black."""
+        values = self.appearance(
+            points.positions,
+            directions[points.ray],
+            normals,
+            None if latents is None else latents[points.ray],
+            level_weights,
+        )
+        rendered = torch.zeros(len(directions), 7, device=values.device, dtype=values.dtype)
+        return blend_radiance(rendered.index_add(0, points.ray, points.weights[:, None] * values))
+
+    def shading_normals(
+        self, points: ShadingPoints, level_weights: Float[Tensor, " levels"] | None = None
+    ) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"]]:
+        """Predicted normals, and the normals that the radiance fields see."""
+        predicted = self.surface.predicted_normals(points.positions, level_weights)
+        return predicted, predicted if self.config.radiance_normals == "predicted" else points.density_normals
+
+
+def _middles(origins: Tensor, directions: Tensor, edges: Tensor) -> Tensor:
+    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+    return origins[:, None] + middle[..., None] * directions[:, None]

@@ -1,0 +1,103 @@
+"""The pixels worth training on: those whose rays meet the object's bounds."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy import ndimage
+from torch import Tensor
+
+from illuminerf.fields.bounds import OccupiedCells
+from illuminerf.scene.cameras import Cameras
+from illuminerf.workflow.errors import UserError
+
+_CHUNK = 1 << 16
+
+
+@dataclass
+class RayPool:
+    """Rays of many views in one axis, foreground first.
+
+    Attributes:
+        view: which view each ray belongs to.
+        pixel: row * width + column.
+        near, far: the stretch of the ray inside the bounds.
+        num_foreground: rays [0, num_foreground) have coverage above 0.
+    """
+
+    view: Int[Tensor, " rays"]
+    pixel: Int[Tensor, " rays"]
+    near: Float[Tensor, " rays"]
+    far: Float[Tensor, " rays"]
+    num_foreground: int
+    cameras: Cameras
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def draw(self, num_rays: int, generator: torch.Generator, foreground_share: float = 0.85) -> Int[Tensor, " batch"]:
+        """Random rays, a fixed share of them foreground where there are both kinds."""
+        num_background = len(self) - self.num_foreground
+        num_chosen = num_rays if not num_background else math.ceil(num_rays * foreground_share)
+        if not self.num_foreground:
+            num_chosen = 0
+        device = self.view.device
+        inside = torch.randint(max(self.num_foreground, 1), (num_chosen,), generator=generator, device=device)
+        outside = torch.randint(max(num_background, 1), (num_rays - num_chosen,), generator=generator, device=device)
+        return torch.cat([inside, self.num_foreground + outside])
+
+    def rays(
+        self, index: Int[Tensor, " batch"]
+    ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"], Float[Tensor, " batch"], Float[Tensor, " batch"]]:
+        """Origins, unit directions, near, far."""
+        origins, directions = pixel_rays(self.cameras, self.view[index], self.pixel[index])
+        return origins, directions, self.near[index], self.far[index]
+
+
+def pixel_rays(
+    cameras: Cameras, view: Int[Tensor, " rays"], pixel: Int[Tensor, " rays"]
+) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
+    """Origins and directions through pixel centres, pixels counted along rows."""
+    column, row = pixel % cameras.width, pixel // cameras.width
+    return cameras.rays(view, torch.stack([column, row], -1).float() + 0.5)
+
+
+def gather_rays(
+    cameras: Cameras, alpha: np.ndarray, cells: OccupiedCells, device: torch.device | str = "cpu"
+) -> RayPool:
+    """All pixels whose rays meet occupied cells.
+
+    Args:
+        alpha: float32 [views, height, width]; only says which rays are foreground and which are too far from it.
+
+    Raises:
+        UserError: no ray meets the bounds.
+    """
+    margin = math.ceil(3 * cameras.width / cells.cells.shape[0]) + 2
+    views, pixels, nears, fars, foreground = [], [], [], [], []
+    for view in range(len(cameras)):
+        candidates = np.flatnonzero(ndimage.distance_transform_edt(alpha[view] <= 0) <= margin)
+        for chunk in np.array_split(candidates, max(1, math.ceil(len(candidates) / _CHUNK))):
+            pixel = torch.from_numpy(chunk).to(device)
+            index = torch.full_like(pixel, view)
+            near, far = cells.clip(*pixel_rays(cameras, index, pixel))
+            hit = far > near
+            views.append(index[hit])
+            pixels.append(pixel[hit])
+            nears.append(near[hit])
+            fars.append(far[hit])
+            foreground.append(torch.from_numpy(alpha[view].reshape(-1)[chunk] > 0).to(device)[hit])
+    is_foreground = torch.cat(foreground)
+    if not len(is_foreground):
+        raise UserError("no camera ray meets the object's bounds", fix="check the capture's cameras and scale")
+    order = torch.cat([is_foreground.nonzero()[:, 0], (~is_foreground).nonzero()[:, 0]])
+    return RayPool(
+        torch.cat(views)[order],
+        torch.cat(pixels)[order],
+        torch.cat(nears)[order],
+        torch.cat(fars)[order],
+        int(is_foreground.sum()),
+        cameras,
+    )

@@ -1,0 +1,128 @@
+"""The surface: a signed distance with its normals, and the predicted normals."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from illuminerf.fields.bounds import OccupiedCells
+from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
+from illuminerf.fields.volume_rendering import optical_depth
+from illuminerf.workflow.errors import UserError
+
+_SHARPNESS = 100.0
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """Signed distance and predicted normals."""
+
+    grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(10, 2, 16, 16, 512))
+    """Hash grid of the signed distance."""
+    hidden_width: int = 64
+    """Width of its one hidden layer."""
+    normal_grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(8, 2, 15, 32, 512))
+    """Hash grid that is used for predicted normals only (supplement A.1)."""
+    normal_hidden_width: int = 32
+    """Width of the hidden layer of the predicted normals."""
+    initial_radius: float = 0.5
+    """The signed distance starts as a sphere of this radius."""
+    initial_beta: float = 0.05
+    """First value of VolSDF's beta, which is learned."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.initial_radius < 1 or self.initial_beta <= 0:
+            raise UserError("initial radius must be in (0, 1) and beta above 0", got=str(self))
+
+
+class SurfacePoint(NamedTuple):
+    """What the surface is at given positions."""
+
+    signed_distance: Float[Tensor, " points"]
+    gradient: Float[Tensor, "points 3"]
+
+
+class SurfaceField(nn.Module):
+    """Signed distance |x| - radius + MLP(hash(x)), positive outside, with its analytic gradient."""
+
+    def __init__(self, config: SurfaceConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.grid = HashGrid(config.grid)
+        self.hidden = nn.Linear(config.grid.width, config.hidden_width)
+        self.head = nn.Linear(config.hidden_width, 1)
+        nn.init.zeros_(self.head.bias)
+        self.log_beta = nn.Parameter(torch.tensor(float(config.initial_beta)).log())
+        self.normal_grid = HashGrid(config.normal_grid)
+        self.normal_mlp = nn.Sequential(
+            nn.Linear(config.normal_grid.width, config.normal_hidden_width),
+            nn.ReLU(),
+            nn.Linear(config.normal_hidden_width, 3),
+        )
+
+    @property
+    def beta(self) -> Float[Tensor, ""]:
+        """VolSDF's beta, at least 5e-4 so that float32 optical depths stay finite."""
+        return self.log_beta.exp() + 5e-4
+
+    def forward(
+        self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
+    ) -> SurfacePoint:
+        """Signed distance and its gradient.
+
+        The gradient of the small MLP is written out (softplus' is the sigmoid) and chained with the Jacobian of the
+        hash grid; both are ordinary differentiable functions of the parameters.
+        """
+        features, jacobian = self.grid.with_jacobian(positions, level_weights)
+        before = self.hidden(features)
+        distance = self.head(_softplus(before))[..., 0]
+        by_feature = (torch.sigmoid(_SHARPNESS * before) * self.head.weight) @ self.hidden.weight
+        gradient = torch.einsum("nf,nfi->ni", by_feature, jacobian)
+        radius = positions.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        return SurfacePoint(distance + radius[..., 0] - self.config.initial_radius, gradient + positions / radius)
+
+    def signed_distance(
+        self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
+    ) -> Float[Tensor, " points"]:
+        """Signed distance alone, which is cheaper."""
+        hidden = _softplus(self.hidden(self.grid(positions, level_weights)))
+        return self.head(hidden)[..., 0] + positions.norm(dim=-1) - self.config.initial_radius
+
+    def predicted_normals(
+        self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
+    ) -> Float[Tensor, "points 3"]:
+        """Unit normals from their own hash grid; they point away from the origin before training."""
+        raw = self.normal_mlp(self.normal_grid(positions, level_weights))
+        return functional.normalize(raw + positions, dim=-1, eps=1e-6)
+
+    def depths_along(
+        self,
+        point: SurfacePoint,
+        directions: Float[Tensor, "rays 3"],
+        edges: Float[Tensor, "rays edges"],
+    ) -> Float[Tensor, "rays samples"]:
+        """Optical depths of the intervals of rays whose middles are `point` (rays * samples in one axis)."""
+        shape = (edges.shape[0], edges.shape[1] - 1)
+        slope = (point.gradient.view(*shape, 3) * directions[:, None]).sum(-1)
+        return optical_depth(point.signed_distance.view(shape), slope, edges[:, 1:] - edges[:, :-1], self.beta)
+
+
+def _softplus(value: Tensor) -> Tensor:
+    # softplus of sharpness 100, cheaper than torch's by its own threshold branch
+    return value.clamp_min(0) + torch.log1p(torch.exp(-_SHARPNESS * value.abs())) / _SHARPNESS
+
+
+@torch.no_grad()
+def surface_cells(surface: SurfaceField, cells: OccupiedCells) -> OccupiedCells:
+    """Those of the given cells that the fitted surface or its soft shell can touch."""
+    side = cells.cells.shape[0]
+    index = cells.cells.nonzero()
+    distance = torch.cat([surface.signed_distance((chunk + 0.5) * (2 / side) - 1) for chunk in index.split(1 << 17)])
+    # half a cell's diagonal, and as far as the density is worth anything
+    reach = 1.75 / side + 6 * float(surface.beta)
+    kept = torch.zeros_like(cells.cells)
+    kept[tuple(index[distance < reach].T)] = True
+    return OccupiedCells(kept)
