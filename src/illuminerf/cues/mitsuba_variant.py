@@ -88,5 +88,6 @@ def load_mitsuba(device: str = "auto") -> ModuleType:
         raise UserError(
             f"Mitsuba's {variant} does not start", got=str(error).splitlines()[0], fix="render with --device cpu"
         ) from error
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)  # it warns of every rounding of a sample count
     _chosen.append(variant)
     return mitsuba

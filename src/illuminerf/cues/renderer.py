@@ -1,6 +1,6 @@
-"""Radiance cues: what four simple materials on the object's geometry look like under a light (paper, 3.2 and supplement).
+"""Radiance cues: what four simple materials on the object's geometry look like under a light.
 
-One white diffuse material and three white GGX conductors of roughness 0.05, 0.13 and 0.34, path traced. The same
+Paper, section 3.2 and supplement: one white diffuse material and three white GGX conductors of roughness 0.05, 0.13 and 0.34, path traced. The same
 function serves training pairs and inference, so the relighting model sees one kind of cue.
 """
 

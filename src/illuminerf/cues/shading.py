@@ -44,7 +44,8 @@ class ShadedScene:
 
     def properties(self, cameras: Cameras, view: int) -> dict[str, np.ndarray]:
         """What the surface is, without light: base_color [h, w, 3] linear, roughness and metallic [h, w] and the
-        world-space shading normal [h, w, 3] turned towards the camera. 0 where nothing is seen."""
+        world-space shading normal [h, w, 3] turned towards the camera. 0 where nothing is seen; all but the unit
+        normal are premultiplied by coverage [h, w]."""
         shapes = {f"part{i}": _shape(m, material, self._device, "color") for i, (m, material) in enumerate(self._parts)}
         others = {
             f"part{i}": _shape(m, material, self._device, "others") for i, (m, material) in enumerate(self._parts)
@@ -115,13 +116,14 @@ def _merged(parts: list[tuple[TriangleMesh, Material]]) -> list[tuple[TriangleMe
 
 
 def _shape(mesh: TriangleMesh, material: Material, device: str, show: str = "shaded") -> Any:
-    """A Mitsuba shape that is shaded, or that shows "color" or "others" (roughness, metallic, 0) as its albedo."""
+    """A Mitsuba shape that is shaded, or that shows "color" or "others" (roughness, metallic, 1) as its albedo."""
     mi = load_mitsuba(device)
     attributes = None
     if material.is_textured:
         arrays = material.images()
         sources = [
-            {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(array)), "raw": True} for array in arrays
+            {"type": "bitmap", "bitmap": mi.Bitmap(np.array(array, np.float32, order="C")), "raw": True}
+            for array in arrays
         ]
         packed: dict[str, Any] = {"type": "bitmap", "bitmap": mi.Bitmap(_packed(arrays)), "raw": True}
     else:
@@ -139,7 +141,7 @@ def _shape(mesh: TriangleMesh, material: Material, device: str, show: str = "sha
 
 
 def _packed(arrays: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-    return np.ascontiguousarray(np.concatenate([arrays[1], arrays[2], np.zeros_like(arrays[1])], -1))
+    return np.ascontiguousarray(np.concatenate([arrays[1], arrays[2], np.ones_like(arrays[1])], -1))
 
 
 def _unpacked(first: np.ndarray, second: np.ndarray, cameras: Cameras, view: int) -> dict[str, np.ndarray]:
@@ -153,5 +155,6 @@ def _unpacked(first: np.ndarray, second: np.ndarray, cameras: Cameras, view: int
         "base_color": color,
         "roughness": second[..., 0],
         "metallic": second[..., 1],
+        "coverage": second[..., 2],
         "normal": np.where(away, -normal, normal).astype(np.float32),
     }

@@ -1,0 +1,103 @@
+"""Textures moved onto the vertices of a finer mesh, so that every object is one shape with one kind of material.
+
+A path tracer that compiles its kernels compiles anew for each number of textured shapes: 10 to 30 s for an object that
+renders in 3. After baking, all objects share one kernel. At 128 pixels the result differs from the textured one by
+less than the noise.
+"""
+
+import numpy as np
+from PIL import Image
+
+from illuminerf.cues.materials import Material
+from illuminerf.scene.meshes import TriangleMesh
+
+_MAX_ROUNDS = 9
+_FACES_PER_SQUARED_EDGE = 6.0  # how many faces a unit of area takes when split to a longest edge of 1
+
+
+def baked(
+    parts: list[tuple[TriangleMesh, Material]], max_edge: float = 0.025, max_faces: int = 100_000
+) -> list[tuple[TriangleMesh, Material]]:
+    """Replace textured parts by finely split ones with per-vertex values.
+
+    Args:
+        parts: meshes with materials, in the unit sphere.
+        max_edge: longest edge of textured faces after splitting, world units; a pixel or two.
+        max_faces: edges are let grow so that about this many faces come out.
+    """
+    area = sum(_area(mesh) for mesh, material in parts if material.is_textured)
+    edge = max(max_edge, float(np.sqrt(_FACES_PER_SQUARED_EDGE * area / max_faces)))
+    return [_baked_part(mesh, material, edge) if material.is_textured else (mesh, material) for mesh, material in parts]
+
+
+def split_to_edge(corners: np.ndarray, max_edge: float) -> np.ndarray:
+    """Split triangles at their edges' middles until no edge is longer than `max_edge`.
+
+    Args:
+        corners: [faces, 3, channels]; the first three channels are the position, the rest is interpolated along.
+        max_edge: in units of the position.
+
+    Returns:
+        [more faces, 3, channels]; T-junctions stay flat, since nothing is displaced.
+    """
+    done = []
+    for _ in range(_MAX_ROUNDS):
+        edges = corners[:, [1, 2, 0], :3] - corners[:, :, :3]
+        is_long = np.linalg.norm(edges, axis=-1).max(1) > max_edge
+        done.append(corners[~is_long])
+        corners = corners[is_long]
+        if not len(corners):
+            break
+        a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        corners = np.concatenate([np.stack(quarter, 1) for quarter in quarters])
+    return np.concatenate([*done, corners])
+
+
+def _area(mesh: TriangleMesh) -> float:
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum() / 2)
+
+
+def _baked_part(mesh: TriangleMesh, material: Material, max_edge: float) -> tuple[TriangleMesh, Material]:
+    assert material.uv is not None
+    corners = np.concatenate([mesh.vertices, mesh.vertex_normals, material.uv], -1)[mesh.faces]
+    texels_per_unit = _texels_per_unit(mesh, material)
+    split = split_to_edge(corners.astype(np.float32), max_edge)
+    flat = split.reshape(-1, split.shape[-1])
+    normals = flat[:, 3:6] / np.maximum(np.linalg.norm(flat[:, 3:6], axis=-1, keepdims=True), 1e-8)
+    faces = np.arange(len(flat), dtype=np.int32).reshape(-1, 3)
+    color, roughness, metallic = (
+        _sampled(image, flat[:, 6:8], texels_per_unit * max_edge / 2) for image in material.images()
+    )
+    values = Material(np.clip(color, 0, 1), np.clip(roughness[:, 0], 0, 1), np.clip(metallic[:, 0], 0, 1))
+    return TriangleMesh(np.ascontiguousarray(flat[:, :3]), faces, normals.astype(np.float32)), values
+
+
+def _texels_per_unit(mesh: TriangleMesh, material: Material) -> float:
+    """How many texels lie along one unit of length on the surface, on average."""
+    assert material.uv is not None
+    height, width = np.asarray(material.base_color).shape[:2]
+    a, b, c = (material.uv[mesh.faces[:, i]] for i in range(3))
+    u, v = b - a, c - a
+    uv_area = float(np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / 2)
+    return float(np.sqrt(max(uv_area * width * height, 1e-12) / max(_area(mesh), 1e-12)))
+
+
+def _sampled(image: np.ndarray, uv: np.ndarray, footprint: float) -> np.ndarray:
+    """Bilinear, repeating samples [n, channels] of an image averaged over `footprint` texels first."""
+    factor = int(np.clip(footprint, 1, min(image.shape[:2])))
+    channels = [image[..., i] for i in range(image.shape[-1])]
+    if factor > 1:
+        channels = [np.asarray(Image.fromarray(np.ascontiguousarray(c)).reduce(factor)) for c in channels]
+    small = np.stack(channels, -1)
+    height, width = small.shape[:2]
+    x = uv[:, 0] * width - 0.5
+    y = (1 - uv[:, 1]) * height - 0.5
+    x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    tx, ty = (x - x0)[:, None], (y - y0)[:, None]
+    texel = lambda row, column: small[row % height, column % width]  # noqa: E731
+    top = texel(y0, x0) * (1 - tx) + texel(y0, x0 + 1) * tx
+    bottom = texel(y0 + 1, x0) * (1 - tx) + texel(y0 + 1, x0 + 1) * tx
+    return (top * (1 - ty) + bottom * ty).astype(np.float32)
