@@ -1,0 +1,158 @@
+"""From rendered items to training examples: augmentations that are exact for light transport.
+
+Targets and cues are linear in the light, so any non-negative, tinted mixture of an item's lights is again a correct
+pair of cues and target. Further: one RGB permutation for everything, mirror images, exposure, and random materials
+composited from the cues (not exact, so only a share of the examples, never for evaluation).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from illuminerf.diffusion.cue_coding import encode_cues
+from illuminerf.diffusion.objective import Batch
+from illuminerf.diffusion.training_items import TrainingItem, diffuse_level
+from illuminerf.scene.images import srgb_from_linear
+
+_CUE_ROUGHNESS = (0.05, 0.13, 0.34)
+_DIFFUSE_LIKE_ROUGHNESS = 0.8
+
+
+@dataclass(frozen=True)
+class AugmentationConfig:
+    """How examples are varied."""
+
+    composited_share: float = 0.3
+    """Share of examples whose material is random and composited from the cues."""
+    mixture_share: float = 0.5
+    """Share of input and of target lights that are mixtures of two rendered lights rather than one."""
+    tint: float = 0.2
+    """Standard deviation of the log gain per colour channel of each light in a mixture."""
+    exposure: float = 0.4
+    """Standard deviation of the log exposure of input and target, independently."""
+    level: float = 0.55
+    """Median over examples of the mean diffuse cue (a white object's mean radiance)."""
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.composited_share <= 1 and 0 <= self.mixture_share <= 1):
+            raise ValueError("shares are between 0 and 1")
+        if min(self.tint, self.exposure, self.level) < 0:
+            raise ValueError("tint, exposure and level are not negative")
+
+
+def make_batch(
+    items: list[TrainingItem], batch_size: int, config: AugmentationConfig, generator: torch.Generator
+) -> Batch:
+    """Draw `batch_size` examples; the same generator state gives the same batch."""
+    examples = []
+    for _ in range(batch_size):
+        item = items[_integer(len(items), generator)]
+        albedo_item = items[_integer(len(items), generator)]
+        examples.append(_example(item, albedo_item, config, generator))
+    return stack_examples(examples)
+
+
+def stack_examples(examples: list[tuple[Tensor, Tensor, Tensor, Tensor]]) -> Batch:
+    """(linear input, linear cues, linear target, alpha) per example to a coded batch in channels-last layout."""
+    image, cues, target, alpha = (torch.stack(parts) for parts in zip(*examples, strict=True))
+    masked = torch.cat([srgb_from_linear(image).clamp_max(1) * alpha, alpha], 1)
+    tensors = (masked, encode_cues(cues), srgb_from_linear(target).clamp_max(1) * alpha, alpha)
+    return Batch(*(tensor.contiguous(memory_format=torch.channels_last) for tensor in tensors))
+
+
+def plain_example(item: TrainingItem, input_light: int, target_light: int, level: float = 0.55) -> tuple:
+    """No augmentation: one light to another, both exposed to the same diffuse level. For evaluation."""
+    alpha = item.alpha.float()
+    cues = item.cues.float()
+    gains = [level / diffuse_level(cues[light], alpha) for light in (input_light, target_light)]
+    target = item.targets[target_light].float() * gains[1]
+    return item.targets[input_light].float() * gains[0], cues[target_light] * gains[1], target, alpha
+
+
+def _example(
+    item: TrainingItem, albedo_item: TrainingItem, config: AugmentationConfig, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    alpha = item.alpha.float()
+    order = torch.randperm(len(item.targets), generator=generator).tolist()
+    channels = torch.randperm(3, generator=generator)
+    mixtures = [_mixture(order, config, generator), _mixture(order[::-1], config, generator)]
+    is_composited = _uniform(generator) < config.composited_share
+    material = _random_material(item, albedo_item, generator) if is_composited else None
+    images, cue_stacks = [], []
+    for weights in mixtures:
+        cues = _mixed(item.cues, weights.repeat(1, 4))
+        target = _mixed(item.targets, weights) if material is None else _composited(cues, *material)
+        gain = config.level / diffuse_level(cues, alpha)
+        gain = gain * torch.exp(config.exposure * torch.randn((), generator=generator))
+        images.append((target * gain)[channels])
+        cue_stacks.append((cues * gain).unflatten(0, (4, 3))[:, channels].flatten(0, 1))
+    example = (images[0], cue_stacks[1], images[1], alpha)
+    if _uniform(generator) < 0.5:
+        return tuple(tensor.flip(-1) for tensor in example)  # type: ignore[return-value]
+    return example
+
+
+def _mixture(order: list[int], config: AugmentationConfig, generator: torch.Generator) -> Tensor:
+    """Weights [lights, 3] of one light, or of two, tinted; the first of `order` dominates."""
+    weights = torch.zeros(len(order), 3)
+    weights[order[0]] = 1.0
+    if _uniform(generator) < config.mixture_share:
+        weights[order[0]] = torch.exp(config.tint * torch.randn(3, generator=generator))
+        other = torch.exp(config.tint * torch.randn(3, generator=generator))
+        weights[order[1 % len(order)]] += _uniform(generator) * other
+    return weights
+
+
+def _mixed(lights: Float[Tensor, "lights channels height width"], weights: Tensor) -> Tensor:
+    used = weights.sum(1).nonzero()[:, 0].tolist()
+    return sum(  # type: ignore[return-value]
+        lights[light].float() * weights[light][:, None, None] for light in used
+    )
+
+
+def _random_material(
+    item: TrainingItem, albedo_item: TrainingItem, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(linear albedo [3, h, w], metallic, roughness): own, borrowed or plain texture, with a random tone curve."""
+    kind = _uniform(generator)
+    tint = torch.rand(3, 1, 1, generator=generator)
+    if kind < 0.2:
+        albedo = tint**2 + 0 * item.albedo.float()
+    else:
+        source = (item if kind < 0.5 else albedo_item).albedo.float()
+        # Outside its own object a borrowed texture is black: mirror-fill is not worth it, grey is.
+        covered = (item if kind < 0.5 else albedo_item).alpha.float()
+        source = source * covered + 0.2 * (1 - covered)
+        albedo = source.clamp(1e-3, 1) ** (0.5 + _uniform(generator)) * (0.4 + 0.6 * tint)
+    is_metal = _uniform(generator) < 0.25
+    metallic = torch.tensor(1.0 if is_metal else 0.0)
+    return albedo.clamp(0.01, 0.95), metallic, torch.tensor(0.03 + 0.77 * _uniform(generator))
+
+
+def _composited(cues: Tensor, albedo: Tensor, metallic: Tensor, roughness: Tensor) -> Tensor:
+    """Albedo * diffuse cue + Fresnel * specular cue, interpolated in roughness: linear [3, h, w]."""
+    lobes = cues.unflatten(0, (4, 3))
+    specular = interpolated_specular(lobes, roughness)
+    dielectric = albedo * lobes[0] + 0.05 * specular
+    return metallic * albedo * specular + (1 - metallic) * dielectric
+
+
+def interpolated_specular(lobes: Float[Tensor, "4 3 height width"], roughness: Tensor) -> Tensor:
+    """The white conductor's radiance at any roughness [] or [h, w]; beyond the roughest cue it fades to diffuse."""
+    knots = (*_CUE_ROUGHNESS, _DIFFUSE_LIKE_ROUGHNESS)
+    levels = (lobes[1], lobes[2], lobes[3], lobes[0])
+    result = levels[0]
+    for low, high, level in zip(knots[:-1], knots[1:], levels[1:], strict=True):
+        share = ((roughness - low) / (high - low)).clamp(0, 1)
+        result = result + share * (level - result)
+    return result
+
+
+def _integer(limit: int, generator: torch.Generator) -> int:
+    return int(torch.randint(limit, (), generator=generator))
+
+
+def _uniform(generator: torch.Generator) -> float:
+    return float(torch.rand((), generator=generator))

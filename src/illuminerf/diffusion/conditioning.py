@@ -1,0 +1,237 @@
+"""What the relighting model is told: ConvNets 1 to 3 of the paper (supplement, "Relighting Diffusion Model").
+
+    masked image [4] -> ConvNet 1 -> tokens, zero-padded to the text length
+    masked image [4] -> ConvNet 2 -> texture [12];  texture * cues [12] -> ConvNet 3 -> additive embedding
+
+ConvNet 4 is the first convolution of the trainable copy of the UNet and lives there.
+Vocabulary: *masked image* = sRGB over black and the mask; *cues* = diffuse and three GGX lobes, RGB each, under the
+target light, coded (see `cue_coding`); *texture* = what multiplies the cues; *products* = texture * cues.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+NUM_CUE_CHANNELS = 12
+NUM_IMAGE_CHANNELS = 4
+
+
+@dataclass(frozen=True)
+class PyramidConfig:
+    """Widths of ConvNet 1 or ConvNet 3."""
+
+    widths: tuple[int, ...]
+    """Channels after layer 1 and after each stride-2 layer."""
+    out_channels: int
+    """Channels of the last, zero-initialised layer."""
+    patch: int = 1
+    """Pixel-unshuffle before layer 1. Deviation: 1 in the paper; small models work on few, fat pixels."""
+
+    def __post_init__(self) -> None:
+        if min(self.widths) < 1 or self.out_channels < 1 or self.patch < 1:
+            raise ValueError("widths, out_channels and patch are positive")
+
+
+@dataclass(frozen=True)
+class TextureConfig:
+    """Widths of ConvNet 2 (DiLightNet, Fig. 4)."""
+
+    widths: tuple[int, ...] = (32, 64, 128)
+    """Channels at each resolution, halved between them."""
+    num_blocks: int = 4
+    """Residual blocks at the lowest resolution."""
+    patch: int = 1
+    """Pixel-unshuffle before the first layer, undone after the last. Deviation: 1 in DiLightNet."""
+    is_material: bool = False
+    """Deviation: decode with additive skips and one block per level, and read the texture as non-negative
+    offset + gain * image, so that it can be the albedo of each lobe in full detail (embedded model)."""
+
+    def __post_init__(self) -> None:
+        if min(self.widths) < 8 or any(width % 8 for width in self.widths):
+            raise ValueError("widths are multiples of 8, for the group norms")
+
+
+PAPER_TOKENS = PyramidConfig(widths=(16, 32, 64, 128, 256, 512, 512), out_channels=1024)
+PAPER_EMBEDDING = PyramidConfig(widths=(16, 32, 96, 256), out_channels=320)
+
+
+@dataclass(frozen=True)
+class ConditioningConfig:
+    """The three condition networks; the defaults are the paper's two tables and DiLightNet's ConvNet 2."""
+
+    tokens: PyramidConfig = field(default=PAPER_TOKENS)
+    """ConvNet 1 (first table); 64 tokens of 1024 at 512x512."""
+    texture: TextureConfig = field(default=TextureConfig())
+    """ConvNet 2."""
+    embedding: PyramidConfig = field(default=PAPER_EMBEDDING)
+    """ConvNet 3 (second table)."""
+    text_length: int = 77
+    """Tokens of the text encoder, to which ConvNet 1's are zero-padded."""
+
+
+class Condition(NamedTuple):
+    """What is computed once per image, whatever the number of sampling steps."""
+
+    tokens: Float[Tensor, "batch text_length width"]
+    embedding: Float[Tensor, "batch channels latent_height latent_width"]
+    products: Float[Tensor, "batch 12 height width"]
+
+    def repeated(self, num_samples: int) -> "Condition":
+        """Each image's entry `num_samples` times in a row."""
+        return Condition(*(part.repeat_interleave(num_samples, 0) for part in self))
+
+
+def _flax_default(layer: nn.Conv2d) -> nn.Conv2d:
+    """LeCun normal, truncated at two standard deviations, and zero bias: Flax's default for convolutions."""
+    std = 1 / math.sqrt(layer.weight[0].numel()) / 0.87962566103423978
+    nn.init.trunc_normal_(layer.weight, std=std, a=-2 * std, b=2 * std)
+    return _zero_bias(layer)
+
+
+def _zero_bias(layer: nn.Conv2d) -> nn.Conv2d:
+    if layer.bias is not None:
+        nn.init.zeros_(layer.bias)
+    return layer
+
+
+def _zero_initialised(layer: nn.Conv2d) -> nn.Conv2d:
+    nn.init.zeros_(layer.weight)
+    return _zero_bias(layer)
+
+
+class ConvPyramid(nn.Sequential):
+    """ConvNet 1 and ConvNet 3: [batch, in, height, width] -> [batch, out, height / 2^k, width / 2^k].
+
+    Layer 1, then per stage one stride-1 and one stride-2 convolution, then a zero-initialised last layer; SiLU
+    between layers, none after the last (paper's two tables).
+    """
+
+    def __init__(self, in_channels: int, config: PyramidConfig) -> None:
+        widths = config.widths
+        first = in_channels * config.patch**2
+        # Unshuffled pixels already see their neighbours: a 1x1 stem keeps small models cheap.
+        stem = (
+            nn.Conv2d(first, widths[0], 3, 1, 1) if config.patch == 1 else nn.Conv2d(first, widths[0], 1)
+        )
+        layers: list[nn.Module] = [nn.PixelUnshuffle(config.patch)] if config.patch > 1 else []
+        layers += [_flax_default(stem), nn.SiLU()]
+        for width, next_width in zip(widths[:-1], widths[1:], strict=True):
+            layers += [_flax_default(nn.Conv2d(width, width, 3, 1, 1)), nn.SiLU()]
+            layers += [_flax_default(nn.Conv2d(width, next_width, 3, 2, 1)), nn.SiLU()]
+        layers.append(_zero_initialised(nn.Conv2d(widths[-1], config.out_channels, 3, 1, 1)))
+        super().__init__(*layers)
+
+
+class ResidualBlock(nn.Module):
+    """x + conv3(SiLU(GroupNorm8(conv3 x))) on [batch, width, height, width]."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(width, width, 3, 1, 1),
+            nn.GroupNorm(8, width),
+            nn.SiLU(),
+            nn.Conv2d(width, width, 3, 1, 1),
+        )
+
+    def forward(self, features: Tensor) -> Tensor:
+        return features + self.layers(features)
+
+
+class TextureNetwork(nn.Module):
+    """ConvNet 2: masked image [batch, 4, height, width] -> texture [batch, 12, height, width]."""
+
+    def __init__(self, config: TextureConfig) -> None:
+        super().__init__()
+        self.config = config
+        widths, patch = config.widths, config.patch
+        first = NUM_IMAGE_CHANNELS * patch**2
+        self.stem = nn.Conv2d(first, widths[0], 3, 1, 1) if patch == 1 else nn.Conv2d(first, widths[0], 1)
+        self.downs = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(fine, coarse, 3, 2, 1), nn.GroupNorm(8, coarse), nn.SiLU())
+            for fine, coarse in zip(widths[:-1], widths[1:], strict=True)
+        )
+        self.blocks = nn.Sequential(*(ResidualBlock(widths[-1]) for _ in range(config.num_blocks)))
+        self.ups = nn.ModuleList(
+            nn.Sequential(nn.ConvTranspose2d(coarse, fine, 4, 2, 1), nn.GroupNorm(8, fine), nn.SiLU())
+            for coarse, fine in zip(widths[:0:-1], widths[-2::-1], strict=True)
+        )
+        # A material needs two maps per channel: an offset and a gain on the image.
+        num_maps = NUM_CUE_CHANNELS * (2 if config.is_material else 1)
+        self.refines = nn.ModuleList(ResidualBlock(width) for width in widths[-2::-1] if config.is_material)
+        self.out = nn.Conv2d(widths[0], num_maps * patch**2, 3 if patch == 1 else 1, 1, int(patch == 1))
+        if config.is_material:
+            self._start_as_dim_copy()
+
+    def _start_as_dim_copy(self) -> None:
+        """Before training: diffuse texture = 0.2 + 0.6 * image, gloss nearly none."""
+        with torch.no_grad():
+            self.out.weight.mul_(0.1)
+            start = torch.full((2, NUM_CUE_CHANNELS), -0.3)
+            start[1], start[0, :3], start[1, :3] = 0.0, 0.2, 0.6
+            self.out.bias.copy_(start.reshape(-1).repeat_interleave(self.config.patch**2))
+
+    def forward(
+        self, masked_image: Float[Tensor, "batch 4 height width"]
+    ) -> Float[Tensor, "batch 12 height width"]:
+        patch = self.config.patch
+        features = functional.silu(self.stem(functional.pixel_unshuffle(masked_image, patch)))
+        skips = []
+        for down in self.downs:
+            skips.append(features)
+            features = down(features)
+        features = self.blocks(features)
+        for level, up in enumerate(self.ups):
+            features = up(features)
+            if self.config.is_material:
+                features = self.refines[level](features + skips.pop())
+        maps = functional.pixel_shuffle(self.out(features), patch)
+        if not self.config.is_material:
+            return maps
+        offset, gain = maps.chunk(2, 1)
+        image = masked_image[:, :3].repeat(1, NUM_CUE_CHANNELS // 3, 1, 1)
+        return functional.softplus(offset + gain * image, beta=8.0)
+
+
+class Conditioning(nn.Module):
+    """ConvNets 1 to 3 together."""
+
+    def __init__(self, config: ConditioningConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.tokens = ConvPyramid(NUM_IMAGE_CHANNELS, config.tokens)
+        self.texture = TextureNetwork(config.texture)
+        self.embedding = ConvPyramid(NUM_CUE_CHANNELS, config.embedding)
+
+    def products(
+        self,
+        masked_image: Float[Tensor, "batch 4 height width"],
+        coded_cues: Float[Tensor, "batch 12 height width"],
+    ) -> Float[Tensor, "batch 12 height width"]:
+        """Texture times cues, elementwise."""
+        return self.texture(masked_image) * coded_cues
+
+    def forward(
+        self,
+        masked_image: Float[Tensor, "batch 4 height width"],
+        coded_cues: Float[Tensor, "batch 12 height width"],
+    ) -> Condition:
+        """Args: masked_image: sRGB over black in [0, 1], then the mask. coded_cues: as `encode_cues` gives them."""
+        products = self.products(masked_image, coded_cues)
+        tokens = padded_tokens(self.tokens(masked_image), self.config.text_length)
+        return Condition(tokens, self.embedding(products), products)
+
+
+def padded_tokens(
+    features: Float[Tensor, "batch width rows columns"], text_length: int
+) -> Float[Tensor, "batch text_length width"]:
+    """Flatten to tokens and append zeros up to `text_length` (64 to 77 in the paper)."""
+    tokens = features.flatten(2).transpose(1, 2)
+    if tokens.shape[1] > text_length:
+        raise ValueError(f"{tokens.shape[1]} tokens do not fit into a text of {text_length}")
+    return functional.pad(tokens, (0, 0, 0, text_length - tokens.shape[1]))

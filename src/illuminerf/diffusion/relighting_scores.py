@@ -1,0 +1,140 @@
+"""How good relit images are: PSNR and SSIM over the object, after the best scale per image and colour channel.
+
+The scale (least squares in linear light) takes out what a single image cannot tell: albedo against exposure.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from illuminerf.diffusion.augmentation import interpolated_specular, plain_example, stack_examples
+from illuminerf.diffusion.cue_coding import decode_cues
+from illuminerf.diffusion.relighting_model import RelightingModel
+from illuminerf.diffusion.sampling import Sampler, sample_relit
+from illuminerf.diffusion.training_items import TrainingItem
+from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
+
+
+def rescaled(
+    estimate: Float[Tensor, "batch 3 height width"], target: Float[Tensor, "batch 3 height width"]
+) -> Float[Tensor, "batch 3 height width"]:
+    """`estimate` times the least-squares scale per image and channel in linear light; sRGB in, sRGB out."""
+    ours, truth = linear_from_srgb(estimate), linear_from_srgb(target)
+    scale = (ours * truth).sum((2, 3)) / ours.square().sum((2, 3)).clamp_min(1e-8)
+    return srgb_from_linear(ours * scale[:, :, None, None]).clamp(0, 1)
+
+
+def masked_psnr(
+    estimate: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    alpha: Float[Tensor, "batch 1 height width"],
+) -> Float[Tensor, " batch"]:
+    """PSNR per image over pixels with alpha > 0.5."""
+    mask = (alpha > 0.5).float()
+    errors = ((estimate - target).square() * mask).sum((1, 2, 3)) / (3 * mask.sum((1, 2, 3))).clamp_min(1)
+    return -10 * errors.clamp_min(1e-10).log10()
+
+
+def masked_ssim(
+    estimate: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    alpha: Float[Tensor, "batch 1 height width"],
+) -> Float[Tensor, " batch"]:
+    """SSIM per image (11x11 Gaussian of sigma 1.5, "valid"), averaged over window centres with alpha > 0.5."""
+    offsets = torch.arange(11) - 5
+    line = torch.exp(-offsets.square() / (2 * 1.5**2)).to(estimate)
+    line /= line.sum()
+    window = (line[:, None] * line).expand(3, 1, 11, 11)
+
+    def blurred(image: Tensor) -> Tensor:
+        return functional.conv2d(image, window, groups=3)
+
+    mean_a, mean_b = blurred(estimate), blurred(target)
+    var_a, var_b = blurred(estimate.square()) - mean_a**2, blurred(target.square()) - mean_b**2
+    covariance = blurred(estimate * target) - mean_a * mean_b
+    structure = (2 * covariance + 0.03**2) / (var_a + var_b + 0.03**2)
+    ssim = structure * (2 * mean_a * mean_b + 0.01**2) / (mean_a**2 + mean_b**2 + 0.01**2)
+    mask = (alpha[:, :, 5:-5, 5:-5] > 0.5).float()
+    return (ssim * mask).sum((1, 2, 3)) / (3 * mask.sum((1, 2, 3))).clamp_min(1)
+
+
+def held_out_pairs(items: list[TrainingItem], num_pairs: int) -> list[tuple[TrainingItem, int, int]]:
+    """Deterministic (item, input light, target light), spread over items and lights."""
+    pairs = []
+    for index in range(num_pairs):
+        item = items[(index * max(1, len(items) // num_pairs)) % len(items)]
+        lights = len(item.targets)
+        first = index % lights
+        pairs.append((item, first, (first + 1 + (index // lights) % (lights - 1)) % lights))
+    return pairs
+
+
+def true_composite(item: TrainingItem, linear_cues: Float[Tensor, "12 height width"]) -> Tensor:
+    """Upper bound: compositing the cues with the item's true materials; linear [3, h, w]."""
+    lobes = linear_cues.unflatten(0, (4, 3))
+    specular = interpolated_specular(lobes, item.roughness.float())
+    albedo, metallic = item.albedo.float(), item.metallic.float()
+    return metallic * albedo * specular + (1 - metallic) * (albedo * lobes[0] + 0.04 * specular)
+
+
+@torch.inference_mode()
+def evaluate(
+    model: RelightingModel,
+    items: list[TrainingItem],
+    num_pairs: int = 24,
+    num_samples: int = 4,
+    num_steps: int = 8,
+    sampler: Sampler = "ddim",
+    batch_size: int = 8,
+) -> tuple[dict[str, dict[str, float]], dict[str, Float[Tensor, "pairs 3 height width"]]]:
+    """Scores by estimate ({name: {psnr, ssim}}), and the images, on held-out items.
+
+    Estimates: input (the image itself), mean_albedo (its mean albedo * diffuse cue), anchor (products alone),
+    sample (one sample, averaged), mean (mean of samples), best (best sample), bound (true materials).
+    `spread` is the samples' standard deviation over covered pixels, in sRGB.
+    """
+    pairs = held_out_pairs(items, num_pairs)
+    examples = [plain_example(*pair) for pair in pairs]
+    batch = stack_examples(examples)
+    samples, anchors = [], []
+    for start in range(0, len(pairs), batch_size):
+        image, cues = batch.masked_image[start : start + batch_size], batch.coded_cues[start : start + batch_size]
+        seeds = [[1000 * (start + i) + k for k in range(num_samples)] for i in range(len(image))]
+        samples.append(sample_relit(model, image, cues, seeds, num_steps, sampler))
+        anchors.append(model.anchor(model.condition(image, cues), image[:, 3:]))
+    drawn = torch.cat(samples)
+    bounds = [true_composite(pair[0], example[1]) for pair, example in zip(pairs, examples, strict=True)]
+    images = {
+        "input": batch.masked_image[:, :3],
+        "mean_albedo": _mean_albedo_estimate(batch.masked_image, decode_cues(batch.coded_cues[:, :3])),
+        "anchor": torch.cat(anchors),
+        "mean": drawn.mean(1),
+        "bound": srgb_from_linear(torch.stack(bounds)).clamp_max(1) * batch.alpha,
+    }
+    truth, alpha = batch.target, batch.alpha
+    scores = {name: _scores(image, truth, alpha) for name, image in images.items()}
+    each = torch.stack(
+        [masked_psnr(rescaled(drawn[:, k], truth), truth, alpha) for k in range(num_samples)]
+    )
+    scores["sample"] = {"psnr": float(each.mean())}
+    scores["best"] = {"psnr": float(each.max(0).values.mean())}
+    deviation = drawn.std(1) if num_samples > 1 else torch.zeros_like(truth)
+    scores["spread"] = {"srgb": float((deviation * alpha).sum() / (3 * alpha.sum()))}
+    return scores, images | {"truth": truth, "sample": drawn[:, 0], "diffuse_cue": batch.coded_cues[:, :3]}
+
+
+def _scores(estimate: Tensor, truth: Tensor, alpha: Tensor) -> dict[str, float]:
+    ours = rescaled(estimate, truth)
+    return {
+        "psnr": float(masked_psnr(ours, truth, alpha).mean()),
+        "ssim": float(masked_ssim(ours, truth, alpha).mean()),
+    }
+
+
+def _mean_albedo_estimate(masked_image: Tensor, diffuse: Tensor) -> Tensor:
+    """One colour for the whole object, from the image's mean, times the diffuse cue."""
+    alpha = masked_image[:, 3:]
+    linear = linear_from_srgb(masked_image[:, :3])
+    mean = (linear * alpha).sum((2, 3), keepdim=True) / alpha.sum((2, 3), keepdim=True).clamp_min(1)
+    return srgb_from_linear(mean * diffuse).clamp_max(1) * alpha

@@ -1,0 +1,90 @@
+"""Rendered training items: one object from one camera under a few lights, with its cues and G-buffer.
+
+One safetensors file per item: `targets` [lights, 3, h, w] and `cues` [lights, 12, h, w], linear and premultiplied,
+float16; `alpha` [h, w], `albedo` [3, h, w] (sRGB-coded base colour), `roughness`, `metallic` [h, w], uint8.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from illuminerf.scene.images import linear_from_srgb
+from illuminerf.workflow.checkpoint import load_checkpoint
+from illuminerf.workflow.errors import UserError
+
+_SMALLEST_COVERAGE = 0.02
+_LARGEST_RADIANCE = 1000.0
+
+
+@dataclass(frozen=True)
+class TrainingItem:
+    """One object from one camera; everything straight (not premultiplied), linear and float16 unless said."""
+
+    name: str
+    targets: Float[Tensor, "lights 3 height width"]
+    cues: Float[Tensor, "lights 12 height width"]
+    alpha: Float[Tensor, "1 height width"]
+    albedo: Float[Tensor, "3 height width"]
+    roughness: Float[Tensor, "1 height width"]
+    metallic: Float[Tensor, "1 height width"]
+
+
+def load_items(folder: Path, size: int) -> list[TrainingItem]:
+    """Read every item under `folder` (or its `items/`), area-averaged to `size` pixels, sorted by name.
+
+    Items with almost no covered pixels or without light are left out.
+
+    Raises:
+        UserError: there is no item, or one is corrupt or larger than `size` by no whole factor.
+    """
+    folder = Path(folder)
+    folder = folder / "items" if (folder / "items").is_dir() else folder
+    paths = sorted(folder.glob("*.safetensors"))
+    if not paths:
+        raise UserError(f"{folder} holds no training items", wanted="*.safetensors", fix="render pairs first")
+    items = [_loaded(path, size) for path in paths]
+    return [item for item in items if _is_usable(item)]
+
+
+def _loaded(path: Path, size: int) -> TrainingItem:
+    tensors, _ = load_checkpoint(path)
+    missing = sorted({"targets", "cues", "alpha", "albedo", "roughness", "metallic"} - set(tensors))
+    if missing:
+        raise UserError(f"{path} lacks '{missing[0]}'", fix="render it again")
+    height = tensors["targets"].shape[-1]
+    if height % size:
+        raise UserError(f"{path} is {height} pixels wide", wanted=f"a multiple of {size}")
+    factor = height // size
+
+    def averaged(values: Tensor) -> Tensor:
+        return functional.avg_pool2d(values, factor) if factor > 1 else values
+
+    alpha = averaged(tensors["alpha"].float()[None, None] / 255)
+    straight = (alpha > _SMALLEST_COVERAGE) / alpha.clamp_min(_SMALLEST_COVERAGE)
+
+    def radiance(name: str) -> Tensor:
+        finite = torch.nan_to_num(tensors[name].float(), 0.0, _LARGEST_RADIANCE, 0.0)
+        return (averaged(finite.clamp(0, _LARGEST_RADIANCE)) * straight).clamp_max(_LARGEST_RADIANCE).half()
+
+    def surface(name: str) -> Tensor:
+        return averaged(tensors[name].float().reshape(1, -1, height, height) / 255)[0].half()
+
+    albedo = linear_from_srgb(surface("albedo").float()).half()
+    return TrainingItem(
+        path.stem, radiance("targets"), radiance("cues"), alpha[0].half(), albedo, surface("roughness"),
+        surface("metallic"),
+    )  # fmt: skip
+
+
+def _is_usable(item: TrainingItem) -> bool:
+    covered = float(item.alpha.float().mean())
+    return covered > 0.01 and float(item.cues[:, :3].float().mean((1, 2, 3)).min()) > 1e-4
+
+
+def diffuse_level(cues: Float[Tensor, "12 height width"], alpha: Float[Tensor, "1 height width"]) -> Tensor:
+    """Mean diffuse cue over covered pixels and colours: how bright the light is on this object."""
+    return ((cues[:3] * alpha).sum() / (3 * alpha.sum()).clamp_min(1e-3)).clamp_min(1e-4)
