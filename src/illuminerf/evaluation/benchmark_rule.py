@@ -7,7 +7,7 @@ averaged over views.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -43,6 +43,15 @@ class LightScores:
     """The factor that each channel of the prediction was multiplied by."""
 
 
+@runtime_checkable
+class ViewPairs(Protocol):
+    """Views that may be read from disk when they are indexed; a list of ViewPair is one."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> ViewPair: ...
+
+
 def on_white(rgba: np.ndarray) -> np.ndarray:
     """float32 [height, width, 3]: straight sRGB over white, mixed in sRGB values as the benchmark does."""
     if rgba.shape[-1] == 3:
@@ -72,7 +81,7 @@ def rescaled_prediction(pair: ViewPair, scale: np.ndarray, rescale: Rescale) -> 
 
 
 def score_light(
-    pairs: Sequence[ViewPair],
+    pairs: ViewPairs,
     rescale: Rescale = "median",
     scale_views: Sequence[int] | None = None,
     lpips: ImageMetric | None = None,

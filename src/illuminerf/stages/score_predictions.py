@@ -6,7 +6,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ SCALE_EVERY = 10
 """The benchmark takes its factors from every 10th of its 200 views."""
 
 
-class PairsOnDisk(Sequence[ViewPair]):
+class PairsOnDisk:
     """The views of one scene and light, each read when it is asked for."""
 
     def __init__(self, scene: Path, light: str, names: Sequence[str], predictions: Sequence[Path]) -> None:
@@ -32,13 +32,7 @@ class PairsOnDisk(Sequence[ViewPair]):
     def __len__(self) -> int:
         return len(self.names)
 
-    @overload
-    def __getitem__(self, index: int) -> ViewPair: ...
-    @overload
-    def __getitem__(self, index: slice) -> "PairsOnDisk": ...
-    def __getitem__(self, index: int | slice) -> "ViewPair | PairsOnDisk":
-        if isinstance(index, slice):
-            return PairsOnDisk(self.scene, self.light, self.names[index], self.predictions[index])
+    def __getitem__(self, index: int) -> ViewPair:
         path = self.predictions[index]
         prediction = read_png(path)
         truth = load_test_image(self.scene, self.names[index], self.light)
