@@ -1,5 +1,6 @@
 """The command line: one subcommand per stage, plus `relight` and `demo` that run them all."""
 
+import inspect
 import sys
 import warnings
 from collections.abc import Callable
@@ -41,6 +42,7 @@ def relight_command(
     rotate: float = 0.0,
     exposure: float = 0.0,
     background: str | None = None,
+    model: str | None = None,
 ) -> None:
     """Relight a capture: every stage of the method, from photographs to turntable, mesh and report.
 
@@ -56,10 +58,11 @@ def relight_command(
         rotate: Turns the light about the vertical axis, in degrees, counter-clockwise seen from above.
         exposure: Stops by which the light is made brighter.
         background: Plain background to cut away where the photographs have no masks: white or black.
+        model: Folder of another relighting model than the preset's.
     """
     settings = customised(
         preset, samples=samples, size=size, seed=seed, device=device, rotate_degrees=rotate, exposure_stops=exposure,
-        background=background,
+        background=background, model=model,
     )  # fmt: skip
     pipeline.relight(capture, [pipeline.LightJob(path) for path in light], settings, out)
     say(f"done: {out / 'report.html'}, {out / 'turntable.mp4'}, {out / 'mesh.glb'}")
@@ -90,19 +93,20 @@ def _stage(run: Callable[..., Path], config: type, description: str, inputs: dic
         say(f"done: {options['out']}")
 
     command.__doc__ = description
-    parameters = {name: Positional[kind] for name, kind in inputs.items()}
-    command.__annotations__ = {**parameters, "out": Path, "config": tyro.conf.OmitArgPrefixes[config]}  # type: ignore[valid-type]
-    import inspect
-
+    optional = {name for name, kind in inputs.items() if kind == Path | None}
+    kinds = {name: kind if name in optional else Positional[kind] for name, kind in inputs.items()}
+    kinds |= {"out": Path, "config": tyro.conf.OmitArgPrefixes[config]}  # type: ignore[valid-type]
+    defaults: dict[str, Any] = {"config": config()} | dict.fromkeys(optional)
+    command.__annotations__ = kinds
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
             inspect.Parameter(
                 name,
                 inspect.Parameter.KEYWORD_ONLY,
                 annotation=kind,
-                default=config() if name == "config" else inspect.Parameter.empty,
+                default=defaults.get(name, inspect.Parameter.empty),
             )
-            for name, kind in command.__annotations__.items()
+            for name, kind in kinds.items()
         ]
     )
     return command
@@ -143,7 +147,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
         render_novel_views.run,
         render_novel_views.Config,
         "Render a latent NeRF (or a geometry's own appearance) from a turntable or given cameras.",
-        {"field": Path},
+        {"field": Path, "cameras": Path | None},
     ),
     "evaluate-relighting": _stage(
         evaluate_relighting.run,

@@ -10,7 +10,6 @@ Every line is one stage: a Config and a run(), which loads what is finished, goe
 what was made with other settings. Started again after a kill, this page continues where it stopped.
 """
 
-import dataclasses
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -77,7 +76,7 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
         if job.test_cameras is not None:
             cameras = _in_unit_ball(job.test_cameras, capture, folder / "test_cameras.json")
             made["test_views"] = render_novel_views.run(
-                made["latent_nerf"], dataclasses.replace(preset.test_views, cameras=cameras), folder / "test_views"
+                made["latent_nerf"], cameras, preset.test_views, folder / "test_views"
             )
         if job.test_cameras is not None and job.truth is not None:
             made["scores"] = evaluate_relighting.run(
@@ -95,7 +94,7 @@ def relight_under(capture: Path, geometry: Path, light: Path, preset: Preset, ou
     cues = render_radiance_cues.run(geometry, capture, light, preset.cues, out / "cues")
     relit = relight_views.run(capture, cues, preset.relighting_model, preset.relighting, out / "relit")
     latent_nerf = fit_latent_nerf.run(geometry, capture, relit, preset.latent_nerf, out / "latent_nerf")
-    turntable = render_novel_views.run(latent_nerf, preset.turntable, out / "turntable")
+    turntable = render_novel_views.run(latent_nerf, None, preset.turntable, out / "turntable")
     video = out / "turntable.mp4"
     if not video.exists():
         frames = sorted((turntable / "images").glob("*.png"))

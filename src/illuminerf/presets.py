@@ -1,0 +1,124 @@
+"""Settings of all stages under one name; each preset states its cost and what it is for."""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from illuminerf.cues.renderer import CueSampling
+from illuminerf.fields.optimisation import OptimiserConfig
+from illuminerf.stages import (
+    estimate_geometry,
+    evaluate_relighting,
+    fit_latent_nerf,
+    import_capture,
+    relight_views,
+    render_novel_views,
+    render_radiance_cues,
+)
+from illuminerf.workflow.device import resolve_device
+from illuminerf.workflow.errors import UserError
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One config per stage."""
+
+    name: str
+    description: str
+    """What it is for and what it costs."""
+    capture: import_capture.Config = field(default_factory=import_capture.Config)
+    geometry: estimate_geometry.Config = field(default_factory=estimate_geometry.Config)
+    cues: render_radiance_cues.Config = field(default_factory=render_radiance_cues.Config)
+    relighting_model: str = "embedded"
+    """The weights that ship with the package, or a folder."""
+    relighting: relight_views.Config = field(default_factory=relight_views.Config)
+    latent_nerf: fit_latent_nerf.Config = field(default_factory=fit_latent_nerf.Config)
+    turntable: render_novel_views.Config = field(default_factory=render_novel_views.Config)
+    test_views: render_novel_views.Config = field(default_factory=render_novel_views.Config)
+    evaluation: evaluate_relighting.Config = field(default_factory=evaluate_relighting.Config)
+
+
+EMBEDDED = Preset(
+    name="embedded",
+    description="The default: for two CPU cores and photographs of about 200 pixels; a GPU makes it faster.",
+    capture=import_capture.Config(size=200),
+)
+
+DEMO = dataclasses.replace(
+    EMBEDDED,
+    name="demo",
+    description="The bundled capture in minutes on two CPU cores: fewer steps and samples than `embedded`.",
+    capture=import_capture.Config(),
+    geometry=estimate_geometry.Config(optimiser=OptimiserConfig(num_steps=1000)),
+    cues=render_radiance_cues.Config(sampling=CueSampling(samples_per_pixel=32)),
+    relighting=relight_views.Config(num_samples=4),
+    latent_nerf=fit_latent_nerf.Config(optimiser=OptimiserConfig(num_steps=1500, rays_per_step=1024, warmup_steps=30)),
+    turntable=render_novel_views.Config(
+        turntable=render_novel_views.TurntableConfig(num_views=36, height=160, width=160)
+    ),
+)
+
+PAPER = Preset(
+    name="paper",
+    description=(
+        "The paper's sizes, steps and S = 16, for a large GPU; give a relighting model of that size with --model."
+    ),
+    capture=import_capture.Config(),
+    geometry=estimate_geometry.Config.paper(),
+    relighting=relight_views.Config(num_samples=16),
+    latent_nerf=fit_latent_nerf.Config.paper(),
+    turntable=render_novel_views.Config(
+        turntable=render_novel_views.TurntableConfig(num_views=120, height=512, width=512)
+    ),
+)
+
+PRESETS = {preset.name: preset for preset in (EMBEDDED, DEMO, PAPER)}
+
+
+def customised(
+    name: str,
+    *,
+    samples: int | None = None,
+    size: int | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    rotate_degrees: float = 0.0,
+    exposure_stops: float = 0.0,
+    background: str | None = None,
+    model: str | None = None,
+) -> Preset:
+    """A preset with what a caller wants otherwise; None keeps the preset's own value.
+
+    Raises:
+        UserError: no such preset or device, or a value is out of range.
+    """
+    if name not in PRESETS:
+        raise UserError("unknown preset", got=repr(name), wanted=" or ".join(PRESETS))
+    resolve_device(device)
+    preset = PRESETS[name]
+    capture: dict[str, Any] = {} if size is None else {"size": size}
+    if background is not None:
+        if background not in ("white", "black", "none"):
+            raise UserError("unknown background", got=repr(background), wanted="white, black or none")
+        capture["background"] = background
+    drawn: dict[str, Any] = {} if samples is None else {"num_samples": samples}
+    common = {"seed": seed, "device": device}
+    change = dataclasses.replace
+    return change(
+        preset,
+        capture=change(preset.capture, **capture),
+        geometry=change(preset.geometry, **common),
+        cues=change(
+            preset.cues,
+            seed=seed,
+            light_rotation_radians=math.radians(rotate_degrees),
+            exposure_stops=exposure_stops,
+            sampling=change(preset.cues.sampling, device=device),
+        ),
+        relighting_model=model or preset.relighting_model,
+        relighting=change(preset.relighting, **drawn, **common),
+        latent_nerf=change(preset.latent_nerf, **common),
+        turntable=change(preset.turntable, device=device),
+        test_views=change(preset.test_views, device=device),
+    )

@@ -1,0 +1,122 @@
+"""The whole method, tiny, on a CPU, without downloads."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from illuminerf import demo, pipeline
+from illuminerf.evaluation.benchmark_rule import score_light, view_pair
+from illuminerf.presets import PRESETS, Preset, customised
+from illuminerf.scene.images import read_png
+from illuminerf.stages import fit_latent_nerf, render_novel_views
+from illuminerf.workflow.artefact import fingerprint
+from illuminerf.workflow.errors import UserError
+
+LIGHT = demo.bundled_capture() / "lights" / "evening.exr"
+STAGES = ("capture", "geometry", "lights/evening/cues", "lights/evening/relit", "lights/evening/latent_nerf")
+
+
+def tiny(samples: int = 1) -> Preset:
+    """All stages for real, at sizes that take seconds."""
+    preset = customised("demo", size=32, samples=samples, device="cpu")
+    steps = dataclasses.replace(preset.geometry.optimiser, num_steps=12, rays_per_step=64, checkpoint_every=4)
+    return dataclasses.replace(
+        preset,
+        geometry=dataclasses.replace(preset.geometry, optimiser=steps, mesh_resolution=40, num_previews=1),
+        cues=dataclasses.replace(
+            preset.cues, sampling=dataclasses.replace(preset.cues.sampling, samples_per_pixel=4), max_light_height=16
+        ),
+        relighting=dataclasses.replace(preset.relighting, num_steps=1),
+        latent_nerf=fit_latent_nerf.Config(optimiser=steps),
+        turntable=render_novel_views.Config(
+            turntable=render_novel_views.TurntableConfig(num_views=2, height=32, width=32)
+        ),
+    )
+
+
+def run_tiny(out: Path) -> None:
+    truth = demo.bundled_capture() / "test" / "evening"
+    pipeline.relight(demo.bundled_capture(), [pipeline.LightJob(LIGHT)], tiny(), out)
+    assert truth.is_dir()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    run_tiny(out)
+    return out
+
+
+def test_a_run_leaves_what_the_readme_promises(finished: Path) -> None:
+    page = (finished / "report.html").read_text()
+    assert "<video" in page and "http" not in page.replace("http-equiv", ""), "the report must open offline"
+    assert (finished / "turntable.mp4").stat().st_size > 500
+    assert (finished / "mesh.glb").stat().st_size > 500
+    assert len(list((finished / "lights/evening/relit/samples").glob("*.png"))) == 30
+
+
+def test_seconds_and_memory_are_on_record(finished: Path) -> None:
+    seconds = pipeline.seconds_by_stage(finished)
+    assert {"capture", "geometry", "cues", "relit", "latent_nerf", "turntable"} <= set(seconds)
+    assert 0.1 < pipeline.peak_memory_gb(finished) < 24
+
+
+def test_a_second_run_loads_everything(finished: Path) -> None:
+    before = {stage: (finished / stage / "DONE").stat().st_mtime_ns for stage in STAGES}
+    run_tiny(finished)
+    assert {stage: (finished / stage / "DONE").stat().st_mtime_ns for stage in STAGES} == before
+
+
+def test_other_settings_are_refused(finished: Path) -> None:
+    with pytest.raises(UserError, match="num_samples is 1 there and 2 here"):
+        pipeline.relight(demo.bundled_capture(), [pipeline.LightJob(LIGHT)], tiny(samples=2), finished)
+
+
+@pytest.mark.slow
+def test_killed_again_and_again_the_result_is_the_same(finished: Path, tmp_path: Path) -> None:
+    """SIGKILL after 2, 6, 10, ... seconds of work, then once to the end."""
+    out = tmp_path / "killed"
+    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from pathlib import Path\n"
+    code += f"import test_pipeline; test_pipeline.run_tiny(Path({str(out)!r}))"
+    environment = {**os.environ, "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "2")}
+    num_kills = 0
+    for seconds in (9, 13, 17, 21):
+        process = subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.DEVNULL)
+        try:
+            process.wait(timeout=seconds)
+            break
+        except subprocess.TimeoutExpired:
+            os.kill(process.pid, signal.SIGKILL)
+            process.wait()
+            num_kills += 1
+            time.sleep(0.1)
+    run_tiny(out)
+    assert num_kills > 0
+    for stage in STAGES:
+        assert fingerprint(out / stage) == fingerprint(finished / stage), stage
+
+
+def test_doing_nothing_scores_what_the_rule_says() -> None:
+    truth = [read_png(path) for path in sorted((demo.bundled_capture() / "test/evening/images").glob("*.png"))]
+    assert demo.input_light_psnr(demo.bundled_capture()) == pytest.approx(19.61, abs=0.05)
+    assert min(score_light([view_pair(image, image) for image in truth]).psnr) > 45
+
+
+def test_every_preset_says_what_it_is_for() -> None:
+    assert all(len(preset.description) > 40 for preset in PRESETS.values())
+    with pytest.raises(UserError, match="unknown preset"):
+        customised("best")
+
+
+def test_scores_file_of_the_demo_has_the_documented_keys(finished: Path, tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    scores = demo.run(out, tiny())
+    written = json.loads((out / "scores.json").read_text())
+    assert set(written) == {"psnr", "ssim", "input_light_psnr", "seconds", "peak_memory_gb"} == set(scores)
