@@ -114,15 +114,16 @@ def _material(mesh: trimesh.Trimesh) -> Material:
     roughness, metallic = (getattr(material, name, None) for name in ("roughnessFactor", "metallicFactor"))
     roughness = 1.0 if roughness is None else float(np.clip(roughness, 0, 1))
     metallic = 1.0 if metallic is None else float(np.clip(metallic, 0, 1))
-    if getattr(mesh.visual, "kind", None) == "vertex":
-        vertex_colors = np.asarray(mesh.visual.vertex_colors, np.float32)[:, :3] / 255
+    visual: Any = mesh.visual
+    if getattr(visual, "kind", None) == "vertex":
+        vertex_colors = np.asarray(visual.vertex_colors, np.float32)[:, :3] / 255
         return Material(vertex_colors, 0.5, 0.0)
-    uv = getattr(mesh.visual, "uv", None)
+    uv = getattr(visual, "uv", None)
     color_image = getattr(material, "baseColorTexture", None)
     other_image = getattr(material, "metallicRoughnessTexture", None)
     if uv is None or (color_image is None and other_image is None):
         return Material(color, roughness, metallic)
-    size = (color_image or other_image).size
+    size = color_image.size if color_image is not None else other_image.size  # type: ignore[union-attr]
     colors = np.broadcast_to(color, (size[1], size[0], 3))
     if color_image is not None:
         colors = colors * _LINEAR_FROM_BYTE[np.asarray(color_image.convert("RGB"))]

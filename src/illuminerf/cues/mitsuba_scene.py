@@ -92,13 +92,7 @@ class MitsubaScene:
             )
             self._sensors[height, width] = (sensor, mi.traverse(sensor))
         sensor, parameters = self._sensors[height, width]
-        fx, fy, cx, cy = cameras.intrinsics[view]
-        if abs(fx / fy - 1) > 1e-3:
-            raise UserError(
-                "the path tracer needs square pixels",
-                got=f"focal lengths {fx:.2f} and {fy:.2f}",
-                fix="resample the images so that fx = fy",
-            )
+        fx, _, cx, cy = cameras.intrinsics[view]
         parameters["x_fov"] = float(np.degrees(2 * np.arctan(0.5 * width / fx)))
         parameters["principal_point_offset_x"] = float(cx / width - 0.5)
         parameters["principal_point_offset_y"] = float(cy / height - 0.5)
@@ -124,8 +118,9 @@ class MitsubaScene:
     def _rendered(
         self, kind: str, options: dict[str, Any], cameras: Cameras, view: int, samples_per_pixel: int, seed: int
     ) -> np.ndarray:
-        sensor, integrator = self._sensor(cameras, view), self._integrator(kind, options)
-        per_pass = max(1, _SAMPLES_PER_PASS // (cameras.height * cameras.width))
+        square = _with_square_pixels(cameras, view)
+        sensor, integrator = self._sensor(square, 0), self._integrator(kind, options)
+        per_pass = max(1, _SAMPLES_PER_PASS // (square.height * square.width))
         num_passes = -(-samples_per_pixel // per_pass)
         total, counted = np.zeros(0, np.float32), 0
         for index in range(num_passes):
@@ -136,7 +131,29 @@ class MitsubaScene:
             # a path of zero probability can give a NaN in single precision; it carries no light
             values = np.nan_to_num(np.array(image, np.float32), nan=0.0, posinf=0.0, neginf=0.0)
             total, counted = (spp * values if index == 0 else total + spp * values), counted + spp
-        return total / np.float32(counted)
+        image = total / np.float32(counted)
+        return image if square.height == cameras.height else _rows_resampled(image, cameras, view)
+
+
+def _with_square_pixels(cameras: Cameras, view: int) -> Cameras:
+    """The view with fy = fx, which is all that Mitsuba's camera knows; its rows are then `_rows_resampled`."""
+    fx, fy, cx, cy = cameras.intrinsics[view]
+    stretch = fx / fy
+    if abs(stretch - 1) * cameras.height < 0.02:  # a fiftieth of a pixel over the whole image
+        return cameras[view]
+    intrinsics = np.array([[fx, fx, cx, cy * stretch]])
+    return Cameras(cameras[view].world_from_camera, intrinsics, int(np.ceil(cameras.height * stretch)), cameras.width)
+
+
+def _rows_resampled(image: np.ndarray, cameras: Cameras, view: int) -> np.ndarray:
+    """Average square pixels over the rows of the real ones, by the share of each that they cover."""
+    fx, fy, _, _ = cameras.intrinsics[view]
+    edges = np.arange(cameras.height + 1) * fx / fy
+    source = np.arange(image.shape[0])
+    shares = np.minimum(edges[1:, None], source + 1) - np.maximum(edges[:-1, None], source)
+    weights = np.clip(shares, 0, None)
+    weights /= weights.sum(1, keepdims=True)
+    return np.einsum("hs,swc->hwc", weights.astype(np.float32), image)
 
 
 def mitsuba_mesh(

@@ -20,9 +20,9 @@ _chosen: list[str] = []
 def find_llvm() -> tuple[str, int] | None:
     """The first libLLVM that loads and is new enough: (path or soname, major version), or None."""
     candidates = [os.environ.get("DRJIT_LIBLLVM_PATH", "")]
-    for version in range(_NEWEST_LLVM, _OLDEST_LLVM - 1, -1):
-        candidates += [f"libLLVM.so.{version}.1", f"libLLVM.so.{version}", f"libLLVM-{version}.so"]
-        candidates += [f"/usr/lib/llvm-{version}/lib/libLLVM.so", f"/opt/homebrew/opt/llvm@{version}/lib/libLLVM.dylib"]
+    for major in range(_NEWEST_LLVM, _OLDEST_LLVM - 1, -1):
+        candidates += [f"libLLVM.so.{major}.1", f"libLLVM.so.{major}", f"libLLVM-{major}.so"]
+        candidates += [f"/usr/lib/llvm-{major}/lib/libLLVM.so", f"/opt/homebrew/opt/llvm@{major}/lib/libLLVM.dylib"]
     candidates.append(ctypes.util.find_library("LLVM") or "")
     for candidate in filter(None, candidates):
         version = _llvm_version(candidate)

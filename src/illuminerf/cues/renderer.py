@@ -1,7 +1,7 @@
 """Radiance cues: what four simple materials on the object's geometry look like under a light.
 
-Paper, section 3.2 and supplement: one white diffuse material and three white GGX conductors of roughness 0.05, 0.13 and 0.34, path traced. The same
-function serves training pairs and inference, so the relighting model sees one kind of cue.
+Paper, section 3.2 and supplement: one white diffuse material and three white GGX lobes of roughness 0.05, 0.13 and
+0.34, path traced. The same function serves training pairs and inference, so the relighting model sees one kind of cue.
 """
 
 from collections.abc import Iterator
@@ -113,7 +113,7 @@ def render_cues(
 
     Args:
         mesh: the object in the world of the cameras.
-        cameras: the views; the principal point may be anywhere, pixels are square.
+        cameras: the views; the principal point may be anywhere.
         light: linear radiance in the world's axes.
         sampling: paths and bounces.
         seed: each view's own seed is derived from it and the view's index, so views do not depend on each other.

@@ -46,17 +46,15 @@ class ShadedScene:
         """What the surface is, without light: base_color [h, w, 3] linear, roughness and metallic [h, w] and the
         world-space shading normal [h, w, 3] turned towards the camera. 0 where nothing is seen; all but the unit
         normal are premultiplied by coverage [h, w]."""
-        shapes = {f"part{i}": _shape(m, material, self._device, "color") for i, (m, material) in enumerate(self._parts)}
-        others = {
-            f"part{i}": _shape(m, material, self._device, "others") for i, (m, material) in enumerate(self._parts)
+        shapes = {
+            f"part{i}": _shape(mesh, material, self._device, unlit=True)
+            for i, (mesh, material) in enumerate(self._parts)
         }
-        dim = EnvironmentMap(np.ones((2, 4, 3), np.float32))
-        first = MitsubaScene(shapes, dim, self._device).render_aovs(
-            "color:albedo,normal:sh_normal,depth:depth", cameras, view, _PROPERTY_SAMPLES, 0
-        )
-        second = MitsubaScene(others, dim, self._device).render_aovs(
-            "other:albedo", cameras, view, _PROPERTY_SAMPLES, 0
-        )
+        scene = MitsubaScene(shapes, EnvironmentMap(np.ones((2, 4, 3), np.float32)), self._device)
+        first = scene.render_aovs("color:albedo,normal:sh_normal,depth:depth", cameras, view, _PROPERTY_SAMPLES, 0)
+        for index, (mesh, material) in enumerate(self._parts):
+            _show_other_properties(scene, f"part{index}", mesh, material)
+        second = scene.render_aovs("other:albedo", cameras, view, _PROPERTY_SAMPLES, 0)
         return _unpacked(first, second, cameras, view)
 
 
@@ -115,33 +113,34 @@ def _merged(parts: list[tuple[TriangleMesh, Material]]) -> list[tuple[TriangleMe
     return [(concatenated([mesh for mesh, _ in plain]), merged), *textured]
 
 
-def _shape(mesh: TriangleMesh, material: Material, device: str, show: str = "shaded") -> Any:
-    """A Mitsuba shape that is shaded, or that shows "color" or "others" (roughness, metallic, 1) as its albedo."""
+def _shape(mesh: TriangleMesh, material: Material, device: str, unlit: bool = False) -> Any:
+    """A Mitsuba shape of its material, or with `unlit` one whose albedo is its base colour, for `render_aovs`."""
     mi = load_mitsuba(device)
     attributes = None
     if material.is_textured:
-        arrays = material.images()
-        sources = [
+        sources: list[dict[str, Any]] = [
             {"type": "bitmap", "bitmap": mi.Bitmap(np.array(array, np.float32, order="C")), "raw": True}
-            for array in arrays
+            for array in material.images()
         ]
-        packed: dict[str, Any] = {"type": "bitmap", "bitmap": mi.Bitmap(_packed(arrays)), "raw": True}
     else:
-        arrays = material.per_vertex(len(mesh.vertices))
         names = ("vertex_color", "vertex_roughness", "vertex_metallic")
-        attributes = dict(zip(names, arrays, strict=True)) | {"vertex_packed": _packed(arrays)}
+        attributes = dict(zip(names, material.per_vertex(len(mesh.vertices)), strict=True))
         sources = [{"type": "mesh_attribute", "name": name} for name in names]
-        packed = {"type": "mesh_attribute", "name": "vertex_packed"}
-    if show == "shaded":
-        bsdf = {"type": "principled", "base_color": sources[0], "roughness": sources[1], "metallic": sources[2]}
-    else:
-        bsdf = {"type": "diffuse", "reflectance": sources[0] if show == "color" else packed}
+    bsdf = {"type": "principled", "base_color": sources[0], "roughness": sources[1], "metallic": sources[2]}
+    if unlit:
+        bsdf = {"type": "diffuse", "reflectance": sources[0]}
     two_sided = {"type": "twosided", "front": bsdf}
     return mitsuba_mesh(mi, "part", mesh.vertices, mesh.faces, two_sided, mesh.vertex_normals, material.uv, attributes)
 
 
-def _packed(arrays: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-    return np.ascontiguousarray(np.concatenate([arrays[1], arrays[2], np.ones_like(arrays[1])], -1))
+def _show_other_properties(scene: MitsubaScene, shape: str, mesh: TriangleMesh, material: Material) -> None:
+    """Exchange the albedo of an unlit shape for (roughness, metallic, 1)."""
+    arrays = material.images() if material.is_textured else material.per_vertex(len(mesh.vertices))
+    packed = np.concatenate([arrays[1], arrays[2], np.ones_like(arrays[1])], -1).astype(np.float32)
+    ending = "reflectance.data" if material.is_textured else "vertex_color"
+    name = next(n for n in scene.parameters.keys() if n.startswith(f"{shape}.") and n.endswith(ending))  # noqa: SIM118
+    values = scene.mitsuba.TensorXf(packed) if material.is_textured else packed.ravel()
+    scene.set_values(**{name.replace(".", "__"): values})
 
 
 def _unpacked(first: np.ndarray, second: np.ndarray, cameras: Cameras, view: int) -> dict[str, np.ndarray]:

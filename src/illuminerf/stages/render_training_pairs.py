@@ -200,6 +200,7 @@ def _rendered(
     scene = ShadedScene(baked(parts) if config.bakes_textures else parts, lights[0], config.cue_sampling.device)
     tracer = MitsubaCueRenderer(concatenated([mesh for mesh, _ in parts]), lights[0], config.cue_sampling)
     targets, cues = [], []
+    alpha = np.zeros(0, np.float32)
     for index, light in enumerate(lights):
         image = scene.render(camera, 0, light, config.samples_per_pixel, derived_seed(seed, "target", index))
         targets.append(image[..., :3].transpose(2, 0, 1))
