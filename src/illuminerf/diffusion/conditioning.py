@@ -176,9 +176,8 @@ class TextureNetwork(nn.Module):
             start[1], start[0, :3], start[1, :3] = 0.0, 0.2, 0.6
             self.out.bias.copy_(start.reshape(-1).repeat_interleave(self.config.patch**2))
 
-    def forward(
-        self, masked_image: Float[Tensor, "batch 4 height width"]
-    ) -> Float[Tensor, "batch 12 height width"]:
+    def maps(self, masked_image: Float[Tensor, "batch 4 height width"]) -> Float[Tensor, "batch maps height width"]:
+        """What the network itself gives: the texture, or a material's offsets and gains (24 maps)."""
         patch = self.config.patch
         features = functional.silu(self.stem(functional.pixel_unshuffle(masked_image, patch)))
         skips = []
@@ -190,12 +189,21 @@ class TextureNetwork(nn.Module):
             features = up(features)
             if self.config.is_material:
                 features = self.refines[level](features + skips.pop())
-        maps = functional.pixel_shuffle(self.out(features), patch)
+        return functional.pixel_shuffle(self.out(features), patch)
+
+    def texture(
+        self, maps: Float[Tensor, "batch maps height width"], rgb: Float[Tensor, "batch 3 height width"]
+    ) -> Float[Tensor, "batch 12 height width"]:
+        """The texture from the maps and the image; both may be larger than the network's own input."""
         if not self.config.is_material:
             return maps
         offset, gain = maps.chunk(2, 1)
-        image = masked_image[:, :3].repeat(1, NUM_CUE_CHANNELS // 3, 1, 1)
-        return functional.softplus(offset + gain * image, beta=8.0)
+        return functional.softplus(offset + gain * rgb.repeat(1, NUM_CUE_CHANNELS // 3, 1, 1), beta=8.0)
+
+    def forward(
+        self, masked_image: Float[Tensor, "batch 4 height width"]
+    ) -> Float[Tensor, "batch 12 height width"]:
+        return self.texture(self.maps(masked_image), masked_image[:, :3])
 
 
 class Conditioning(nn.Module):

@@ -7,6 +7,7 @@ from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from jaxtyping import Float
 from torch import Tensor
 
+from illuminerf.diffusion.conditioning import Condition
 from illuminerf.diffusion.relighting_model import RelightingModel, noise_schedule
 from illuminerf.workflow.device import torch_generator
 
@@ -30,6 +31,34 @@ def sampling_schedule(sampler: Sampler, num_steps: int) -> Any:
 
 
 @torch.inference_mode()
+def sample_decoded(
+    model: RelightingModel,
+    condition: Condition,
+    seeds: list[list[int]],
+    num_steps: int,
+    sampler: Sampler,
+) -> Float[Tensor, "batch samples 3 height width"]:
+    """Decoded latents as they are: residuals to the anchor, or images in [-1, 1] (arguments as `sample_relit`)."""
+    num_samples = len(seeds[0])
+    if len(seeds) != len(condition.products) or any(len(row) != num_samples for row in seeds):
+        raise ValueError("seeds are one list per image, all of one length")
+    device = condition.products.device
+    generators = [torch_generator(seed, "sample") for row in seeds for seed in row]
+    block = model.config.latents.block
+    height, width = condition.products.shape[2:]
+    shape = (model.config.latents.channels, height // block, width // block)
+    latent = torch.stack([torch.randn(shape, generator=generator) for generator in generators]).to(device)
+    repeated = condition.repeated(num_samples)
+    scheduler = sampling_schedule(sampler, num_steps)
+    extra = {"generator": generators} if sampler == "ddpm" else {}
+    for timestep in scheduler.timesteps:
+        steps = torch.full((len(latent),), int(timestep), device=device)
+        predicted = model(latent, steps, repeated)
+        latent = scheduler.step(predicted, timestep, latent, return_dict=False, **extra)[0]
+    return model.latents.decode(latent).unflatten(0, (len(seeds), num_samples))
+
+
+@torch.inference_mode()
 def sample_relit(
     model: RelightingModel,
     masked_image: Float[Tensor, "batch 4 height width"],
@@ -46,27 +75,9 @@ def sample_relit(
         seeds: one list per image, of equal length: one seed per sample. A seed alone decides a sample's noise,
             whatever else is in the batch.
     """
-    num_samples = len(seeds[0])
-    if len(seeds) != len(masked_image) or any(len(row) != num_samples for row in seeds):
-        raise ValueError("seeds are one list per image, all of one length")
-    device = masked_image.device
-    generators = [torch_generator(seed, "sample") for row in seeds for seed in row]
     condition = model.condition(masked_image, coded_cues)
-    alpha = masked_image[:, 3:]
-    anchor = model.anchor(condition, alpha)
-    condition = condition.repeated(num_samples)
-
-    block = model.config.latents.block
-    shape = (model.config.latents.channels, masked_image.shape[2] // block, masked_image.shape[3] // block)
-    latent = torch.stack([torch.randn(shape, generator=generator) for generator in generators]).to(device)
-    scheduler = sampling_schedule(sampler, num_steps)
-    extra = {"generator": generators} if sampler == "ddpm" else {}
-    for timestep in scheduler.timesteps:
-        steps = torch.full((len(latent),), int(timestep), device=device)
-        predicted = model(latent, steps, condition)
-        latent = scheduler.step(predicted, timestep, latent, return_dict=False, **extra)[0]
-
-    relit = model.latents.decode(latent).unflatten(0, (len(masked_image), num_samples))
+    decoded = sample_decoded(model, condition, seeds, num_steps, sampler)
+    alpha = masked_image[:, None, 3:]
     if not model.config.latent_is_residual:
-        relit = (relit + 1) / 2
-    return (relit + anchor[:, None]).clamp(0, 1) * alpha[:, None]
+        return ((decoded + 1) / 2).clamp(0, 1) * alpha
+    return (decoded + model.anchor(condition, masked_image[:, 3:])[:, None]).clamp(0, 1) * alpha

@@ -2,7 +2,7 @@
 
 Batches derive from (seed, step, process) alone, so an interrupted run goes on exactly where it stopped. The run grows in
 phases: resolution and terms of the loss change at fixed steps (small models on few cores learn most at 64 pixels).
-Several processes under `accelerate launch` average their gradients.
+The folder of items may still be growing: it is listed again at every checkpoint.
 """
 
 import json
@@ -143,7 +143,9 @@ class _Training:
         model = load_model(Path(config.initial_model)) if config.initial_model else RelightingModel(config.model)
         self.model = model.train().to(self.accelerator.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = WeightAverage(self.model, config.average_decay)
-        self.optimizer = torch.optim.AdamW(self.model.parameters(), lr=config.peak_learning_rate, weight_decay=0.01)
+        self.optimizer = torch.optim.AdamW(
+            self.model.parameters(), lr=config.peak_learning_rate, weight_decay=0.01, fused=True
+        )
         self.checkpoint = out / _CHECKPOINT
         self.step = 0
         if self.checkpoint.exists():
@@ -165,6 +167,7 @@ class _Training:
                 self.seconds = now - started
                 if self.accelerator.is_main_process and now - checked > self.config.checkpoint_seconds:
                     self.save()
+                    self.items.clear()
                     checked = now
                 if self.accelerator.is_main_process and now - validated > self.config.validation_seconds:
                     self.validate(self.step)

@@ -1,0 +1,129 @@
+"""Relighting at the photograph's own size with a model of a fixed, smaller one.
+
+The object is cut out as a square, as in the training renders, brought to the model's size and relit. Detail then comes
+back the way it went in: the material maps (offsets and gains on the image) and the sampled residual are smooth and are
+enlarged; the photograph and the cues, which carry the detail, are used at full size.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+from torch.nn import functional
+
+from illuminerf.diffusion.cue_coding import composited_srgb, encode_cues
+from illuminerf.diffusion.relighting_model import RelightingModel
+from illuminerf.diffusion.sampling import Sampler, sample_decoded
+
+_MARGIN = 1.04
+_LEAST_COVERAGE = 0.05
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One view to relight: float32 tensors at full size.
+
+    Attributes:
+        masked_image: [4, height, width], sRGB over black in [0, 1], then alpha.
+        linear_cues: [12, height, width], straight linear radiance under the target light.
+    """
+
+    masked_image: Tensor
+    linear_cues: Tensor
+
+
+def straight_cues(
+    premultiplied: Float[np.ndarray, "12 height width"], coverage: Float[np.ndarray, "height width"]
+) -> Float[np.ndarray, "12 height width"]:
+    """Divide by the mesh's coverage; where the mesh misses the object, repeat the nearest covered pixel."""
+    covered = coverage > _LEAST_COVERAGE
+    if not covered.any():
+        return np.zeros_like(premultiplied)
+    straight = premultiplied / np.maximum(coverage, _LEAST_COVERAGE)
+    rows, columns = distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    return straight[:, rows, columns]
+
+
+def object_square(alpha: Float[Tensor, "height width"]) -> tuple[int, int, int]:
+    """(top, left, side) of a square around the object, a little larger; it may reach over the image's border."""
+    rows = (alpha > 0.5).any(1).nonzero()[:, 0].tolist() or [0, alpha.shape[0] - 1]
+    columns = (alpha > 0.5).any(0).nonzero()[:, 0].tolist() or [0, alpha.shape[1] - 1]
+    side = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
+    side = min(int(np.ceil(side * _MARGIN)), max(alpha.shape))
+    return (rows[0] + rows[-1] + 1 - side) // 2, (columns[0] + columns[-1] + 1 - side) // 2, side
+
+
+def cut_out(image: Float[Tensor, "channels height width"], square: tuple[int, int, int]) -> Tensor:
+    """The square's pixels [channels, side, side]; zeros beyond the border."""
+    top, left, side = square
+    height, width = image.shape[1:]
+    padding = (max(0, -left), max(0, left + side - width), max(0, -top), max(0, top + side - height))
+    padded = functional.pad(image, padding)
+    top, left = max(0, top), max(0, left)
+    return padded[:, top : top + side, left : left + side]
+
+
+def put_back(
+    piece: Float[Tensor, "channels side side"], square: tuple[int, int, int], height: int, width: int
+) -> Tensor:
+    """Undo `cut_out` over black: [channels, height, width]."""
+    top, left, side = square
+    image = piece.new_zeros(piece.shape[0], height, width)
+    rows = slice(max(0, top), min(height, top + side))
+    columns = slice(max(0, left), min(width, left + side))
+    image[:, rows, columns] = piece[
+        :, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left
+    ]
+    return image
+
+
+def resized(images: Float[Tensor, "batch channels height width"], size: int) -> Tensor:
+    """Antialiased bilinear resizing to `size` x `size`."""
+    if images.shape[-1] == size:
+        return images
+    return functional.interpolate(images, (size, size), mode="bilinear", antialias=True, align_corners=False)
+
+
+@torch.inference_mode()
+def relight_photographs(
+    model: RelightingModel,
+    photographs: list[Photograph],
+    seeds: list[list[int]],
+    num_steps: int = 8,
+    sampler: Sampler = "ddim",
+) -> list[Float[Tensor, "samples 3 height width"]]:
+    """Draw relit images of each photograph at its own size: sRGB over black in [0, 1]."""
+    size = model.config.image_size
+    squares = [object_square(photograph.masked_image[3]) for photograph in photographs]
+    pieces = [
+        (cut_out(p.masked_image, square), cut_out(p.linear_cues * p.masked_image[3], square))
+        for p, square in zip(photographs, squares, strict=True)
+    ]
+    masked = torch.cat([resized(image[None], size) for image, _ in pieces])
+    alpha = masked[:, 3:].clamp_min(_LEAST_COVERAGE)
+    cues = torch.cat([resized(cues[None], size) for _, cues in pieces]) / alpha
+    coded = encode_cues(cues * (masked[:, 3:] > _LEAST_COVERAGE))
+    masked = masked.contiguous(memory_format=torch.channels_last)
+    coded = coded.contiguous(memory_format=torch.channels_last)
+
+    condition = model.condition(masked, coded)
+    decoded = sample_decoded(model, condition, seeds, num_steps, sampler)
+    maps = model.conditioning.texture.maps(masked)
+    results = []
+    for index, (photograph, square) in enumerate(zip(photographs, squares, strict=True)):
+        piece, side = pieces[index][0][None], square[2]
+        relit = resized(decoded[index], side)
+        if model.config.latent_is_residual:
+            linear = cut_out(photograph.linear_cues, square)[None]
+            texture = model.conditioning.texture.texture(resized(maps[index : index + 1], side), piece[:, :3])
+            relit = relit + composited_srgb(texture * encode_cues(linear)).clamp_max(1)
+        else:
+            relit = (relit + 1) / 2
+        height, width = photograph.masked_image.shape[1:]
+        results.append(
+            torch.stack([put_back(image, square, height, width) for image in relit.clamp(0, 1) * piece[:, 3:]])
+        )
+    return results

@@ -1,0 +1,134 @@
+"""Capture + radiance cues + relighting model -> S relit samples of every view (paper, section 3.3).
+
+samples/<000>_<00>.png   sRGB over black (premultiplied by the capture's alpha), at the capture's size
+seeds.json               the seed of every sample
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from illuminerf.data.capture import load_capture
+from illuminerf.diffusion.full_size import Photograph, relight_photographs, straight_cues
+from illuminerf.diffusion.pretrained import model_folder
+from illuminerf.diffusion.relighting_model import RelightingModel, load_model
+from illuminerf.diffusion.sampling import Sampler
+from illuminerf.scene.images import read_exr, write_png
+from illuminerf.scene.views import Views
+from illuminerf.workflow.artefact import open_artefact
+from illuminerf.workflow.atomic import write_json
+from illuminerf.workflow.device import derived_seed, resolve_device
+from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.progress import step_progress
+
+STAGE = "relight_views"
+_CUE_NAMES = tuple(f"{lobe}.{c}" for lobe in ("diffuse", "ggx_005", "ggx_013", "ggx_034") for c in "RGB")
+
+
+@dataclass(frozen=True)
+class Config:
+    """How many samples are drawn, and how."""
+
+    num_samples: int = 4
+    """Samples per view (paper: 16)."""
+    num_steps: int = 8
+    """Denoising steps; more is slower and hardly better with the embedded model (docs/model_card.md)."""
+    sampler: Sampler = "ddim"
+    """Deviation: the paper samples with ddpm; few steps need ddim or dpm_solver."""
+    batch_size: int = 4
+    """Views relit at once."""
+    device: str = "auto"
+    """Where it runs: auto, cpu or cuda."""
+    seed: int = 0
+    """A sample's noise derives from it, the view and the sample's number."""
+
+    def __post_init__(self) -> None:
+        if min(self.num_samples, self.num_steps, self.batch_size) < 1:
+            raise UserError("num_samples, num_steps and batch_size must be at least 1")
+        if self.num_samples > 100 or self.num_steps > 1000:
+            raise UserError("at most 100 samples and 1000 steps")
+
+
+def run(capture: Path, cues: Path, model: Path | str, config: Config, out: Path) -> Path:
+    """Relight every view of `capture` into `out`; samples that exist are kept.
+
+    Args:
+        capture: a Capture artefact.
+        cues: a RadianceCues artefact of the same views.
+        model: a RelightingModel folder, or "embedded" for the one inside the package.
+        config: the settings.
+        out: the artefact's folder.
+
+    Raises:
+        UserError: an input is missing or does not fit the others.
+    """
+    folder = model_folder(model)
+    with open_artefact(out, STAGE, config, {"capture": capture, "cues": cues, "model": folder}) as artefact:
+        if artefact.is_done:
+            return out
+        views = load_capture(capture).views
+        seeds = {
+            view: [derived_seed(config.seed, "relight", view, k) for k in range(config.num_samples)]
+            for view in range(len(views))
+        }
+        write_json(out / "seeds.json", {f"{view:03d}": row for view, row in seeds.items()})
+        todo = [
+            view
+            for view in seeds
+            if not all(sample_path(out, view, k).exists() for k in range(config.num_samples))
+        ]
+        device = resolve_device(config.device)
+        network = load_model(folder, device)
+        with step_progress("relight views", len(views), len(views) - len(todo)) as progress:
+            for start in range(0, len(todo), config.batch_size):
+                batch = todo[start : start + config.batch_size]
+                _relight(network, views, cues, batch, [seeds[view] for view in batch], config, out)
+                progress.advance(len(batch))
+        artefact.finish({"num_views": len(views), "num_samples": config.num_samples})
+    return out
+
+
+def sample_path(folder: Path, view: int, sample: int) -> Path:
+    """samples/<000>_<00>.png of the relit views in `folder`."""
+    return folder / "samples" / f"{view:03d}_{sample:02d}.png"
+
+
+def _relight(
+    network: RelightingModel,
+    views: Views,
+    cues: Path,
+    batch: list[int],
+    seeds: list[list[int]],
+    config: Config,
+    out: Path,
+) -> None:
+    device = next(network.parameters()).device
+    photographs = [_photograph(views, view, cues, device) for view in batch]
+    relit = relight_photographs(network, photographs, seeds, config.num_steps, config.sampler)
+    for view, samples in zip(batch, relit, strict=True):
+        for sample, image in enumerate(samples):
+            write_png(sample_path(out, view, sample), image.permute(1, 2, 0).cpu().numpy())
+
+
+def _photograph(views: Views, view: int, cues: Path, device: torch.device) -> Photograph:
+    path = Path(cues) / "cues" / f"{view:03d}.exr"
+    channels = read_exr(path)
+    missing = [name for name in (*_CUE_NAMES, "A") if name not in channels]
+    if missing:
+        raise UserError(f"{path} lacks the channel '{missing[0]}'", fix="render the radiance cues again")
+    alpha = views.alpha[view]
+    if channels["A"].shape != alpha.shape:
+        raise UserError(
+            f"{path} does not fit the capture",
+            got=str(channels["A"].shape),
+            wanted=str(alpha.shape),
+            fix="render the radiance cues from this capture",
+        )
+    straight = straight_cues(np.stack([channels[name] for name in _CUE_NAMES]), channels["A"])
+    masked = np.concatenate([views.srgb[view] * alpha[..., None], alpha[..., None]], -1)
+    return Photograph(
+        torch.from_numpy(np.ascontiguousarray(masked.transpose(2, 0, 1))).float().to(device),
+        torch.from_numpy(straight).float().to(device),
+    )
