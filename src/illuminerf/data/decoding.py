@@ -6,12 +6,13 @@ guess.
 """
 
 import struct
+import warnings
 import zlib
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from illuminerf.data.deep_png import is_deep_colour_png, read_deep_png
 from illuminerf.scene.images import linear_from_srgb, read_exr
@@ -21,6 +22,8 @@ MAX_PIXELS = 120_000_000
 """Larger images are refused before they are decoded: a few kilobytes can unpack to gigabytes."""
 
 EXIF_ORIENTATION = 0x0112
+_TURNED = (5, 6, 7, 8)
+"""Orientations that swap width and height."""
 _DECODING_ERRORS = (OSError, SyntaxError, ValueError, EOFError, RuntimeError, KeyError, struct.error, zlib.error)
 
 
@@ -44,8 +47,11 @@ def _check_size(path: Path, width: int, height: int) -> None:
 
 
 def _open(path: Path) -> Image.Image:
+    """An image whose header is read and whose size is sane; its pixels are not decoded yet."""
     try:
-        return Image.open(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is MAX_PIXELS
+            image = Image.open(path)
     except Image.DecompressionBombError as error:
         raise UserError(
             "an image has an impossible size",
@@ -53,12 +59,23 @@ def _open(path: Path) -> Image.Image:
             wanted=f"at most {MAX_PIXELS:,} pixels",
             fix="export the image smaller",
         ) from error
-    except (UnidentifiedImageError, *_DECODING_ERRORS) as error:
+    except _DECODING_ERRORS as error:
         raise _unreadable(path, error) from error
+    _check_size(path, *image.size)
+    return image
 
 
-def _is_turned(image: Image.Image) -> bool:
-    return image.getexif().get(EXIF_ORIENTATION, 1) in (5, 6, 7, 8)
+def _orientation(path: Path, image: Image.Image) -> int:
+    """The EXIF orientation, 1 to 8; 1 is upright."""
+    try:
+        if image.format == "PNG":  # asking Pillow for it would decode all pixels
+            exif = Image.Exif()
+            exif.load(image.info.get("exif", b""))
+        else:
+            exif = image.getexif()
+    except _DECODING_ERRORS as error:
+        raise _unreadable(path, error) from error
+    return int(exif.get(EXIF_ORIENTATION, 1))
 
 
 def image_size(path: Path, declared: tuple[int, int] | None = None) -> tuple[int, int]:
@@ -73,7 +90,7 @@ def image_size(path: Path, declared: tuple[int, int] | None = None) -> tuple[int
     else:
         with _open(path) as image:
             width, height = image.size
-            if _is_turned(image) and (declared is None or declared != (width, height)):
+            if _orientation(path, image) in _TURNED and declared != (width, height):
                 width, height = height, width
     _check_size(path, width, height)
     return width, height
@@ -116,7 +133,6 @@ def _read_exr_premultiplied(path: Path) -> np.ndarray:
 def read_straight(path: Path, declared: tuple[int, int] | None = None) -> np.ndarray:
     """float32 [height, width, 4] in [0, 1]: sRGB and straight alpha of a display-referred file."""
     with _open(path) as image:
-        _check_size(path, *image.size)
         if image.mode in ("CMYK", "LAB", "F"):
             raise UserError(
                 "an image is in a colour space that cannot be read faithfully",
@@ -124,8 +140,8 @@ def read_straight(path: Path, declared: tuple[int, int] | None = None) -> np.nda
                 wanted="RGB, RGBA, grey or palette",
                 fix="convert it to sRGB in the program that wrote it",
             )
-        orientation = image.getexif().get(EXIF_ORIENTATION, 1)
-        if _is_turned(image) and declared == image.size:
+        orientation = _orientation(path, image)
+        if orientation in _TURNED and declared == image.size:
             orientation = 1
         try:
             deep = image.format == "PNG" and is_deep_colour_png(path)

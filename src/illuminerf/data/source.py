@@ -136,8 +136,9 @@ def rigid_pose(matrix: object, where: str) -> np.ndarray:
             f"the camera pose of {where} is not rigid", got=f"last row {pose[3].tolist()}", wanted="[0, 0, 0, 1]"
         )
     rotation = pose[:3, :3]
-    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    determinant = float(np.linalg.det(rotation))
+    bounded = np.clip(rotation, -1e6, 1e6)  # the product of larger numbers overflows
+    error = float(np.abs(bounded.T @ bounded - np.eye(3)).max())
+    determinant = float(np.linalg.det(bounded))
     if error > RIGIDITY_TOLERANCE or determinant < 0:
         raise UserError(
             f"the camera pose of {where} is not rigid",
