@@ -11,7 +11,7 @@ from illuminerf.data.tensoir import load_test_cameras
 from illuminerf.evaluation.tables import cell_table, published_table
 from illuminerf.presets import Preset, customised
 from illuminerf.scene.images import composite, read_png, write_png
-from illuminerf.stages.score_predictions import score_predictions
+from illuminerf.stages.score_predictions import score_input_light, score_predictions
 from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import console
@@ -64,6 +64,7 @@ def tensoir_command(
     for scene in scenes:
         relight_scene(root / scene, lights, lights_dir, settings, size, every, out)
     scores = score_predictions(root, out / "predictions", scenes, lights, rescale, every, lpips, size)
+    scores["input_light"] = score_input_light(root, scenes, lights, rescale, every, size=size)["psnr"]
     scores["seconds"] = {scene: pipeline.seconds_by_stage(out / scene) for scene in scenes}
     scores["peak_memory_gb"] = {scene: pipeline.peak_memory_gb(out / scene) for scene in scenes}
     write_json(out / "scores.json", scores)

@@ -150,7 +150,8 @@ def _costs(stages: dict[str, Path], lights: dict[str, dict[str, Path]]) -> str:
     versions = read_json(next(iter(stages.values())) / "provenance.json")
     note = html.escape(", ".join(f"{name} {version}" for name, version in versions["versions"].items()))
     head = "<tr><th>stage</th><th>light</th><th>seconds</th><th>peak memory, GB</th></tr>"
-    return f"<h2>Cost</h2><table>{head}{''.join(lines)}</table><p class=note>{note}; {html.escape(versions['platform'])}</p>"
+    note += "; " + html.escape(versions["platform"])
+    return f"<h2>Cost</h2><table>{head}{''.join(lines)}</table><p class=note>{note}</p>"
 
 
 def _exposure(linear_rgb: np.ndarray) -> float:

@@ -14,7 +14,7 @@ from illuminerf.data.distortion import undistorted_image
 from illuminerf.data.resampling import area_downsampled, padded, padding_to
 from illuminerf.data.source import SourceCapture, SourceFrame
 from illuminerf.scene.cameras import Cameras
-from illuminerf.scene.images import srgb_from_linear, to_uint8
+from illuminerf.scene.images import linear_from_srgb, srgb_from_linear, to_uint8
 from illuminerf.workflow.errors import UserError
 
 PlainBackground = Literal["white", "black"]
@@ -114,6 +114,20 @@ def _read_mask(frame: SourceFrame) -> np.ndarray:
             fix="save the mask at the size of the image",
         )
     return mask[..., 3] if mask[..., 3].min() < 1 else mask[..., :3].max(axis=-1)
+
+
+def shrunk(straight: np.ndarray, longest_side: int) -> np.ndarray:
+    """float32 [.., .., 4], straight sRGB and alpha like its argument, area-averaged to `longest_side` pixels;
+    returned as it is where it is no larger.
+    """
+    height, width = straight.shape[:2]
+    shrink = longest_side / max(height, width)
+    if shrink >= 1:
+        return straight
+    linear = linear_from_srgb(straight[..., :3]) * straight[..., 3:]
+    rgba = np.concatenate([linear, straight[..., 3:]], axis=-1)
+    small = area_downsampled(rgba, max(1, round(height * shrink)), max(1, round(width * shrink)))
+    return straight_srgb_uint8(small).astype(np.float32) / 255
 
 
 def straight_srgb_uint8(rgba: np.ndarray) -> np.ndarray:

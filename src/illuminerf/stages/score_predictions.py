@@ -5,12 +5,14 @@
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from illuminerf.data.developing import shrunk
 from illuminerf.data.tensoir import INPUT_LIGHT, TensoirView, find_views, load_test_image
 from illuminerf.evaluation.benchmark_rule import LightScores, Rescale, ViewPair, score_light, view_pair
 from illuminerf.evaluation.metrics import LPIPS_ABSENT, ImageMetric, lpips_vgg
@@ -23,11 +25,16 @@ SCALE_EVERY = 10
 """The benchmark takes its factors from every 10th of its 200 views."""
 
 
+@dataclass(frozen=True)
 class PairsOnDisk:
     """The views of one scene and light, each read when it is asked for."""
 
-    def __init__(self, scene: Path, light: str, names: Sequence[str], predictions: Sequence[Path]) -> None:
-        self.scene, self.light, self.names, self.predictions = scene, light, names, predictions
+    scene: Path
+    light: str
+    names: Sequence[str]
+    predictions: Sequence[Path]
+    size: int | None = None
+    """Pixels that larger images are averaged down to."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -36,6 +43,9 @@ class PairsOnDisk:
         path = self.predictions[index]
         prediction = read_png(path)
         truth = load_test_image(self.scene, self.names[index], self.light)
+        if self.size is not None:
+            truth = shrunk(truth, self.size)
+            prediction = shrunk(_with_alpha(prediction), self.size)
         if prediction.shape[:2] != truth.shape[:2]:
             raise UserError(
                 "a prediction has another size than the truth",
@@ -54,18 +64,20 @@ def score_predictions(
     rescale: Rescale = "median",
     every: int = 1,
     with_lpips: bool = False,
+    size: int | None = None,
 ) -> dict[str, Any]:
     """Score `predictions` against the benchmark in `root`.
 
     Only views that both have, and whose number is a multiple of `every`, are scored. Returns plain JSON:
     psnr, ssim (and lpips) as [scene][light], their mean over lights and then scenes under "mean", the
-    number of views and the factor per channel as [scene][light].
+    number of views and the factor per channel as [scene][light]. With `size`, larger images are averaged
+    down to that many pixels before they are compared.
 
     Raises UserError where a scene, a light or all predictions of one are missing, or where sizes differ.
     """
     cells = _cells(scenes, lights, every)
     plans = [_predicted(root, predictions, scene, light, every) for scene, light in cells]
-    return _scored(cells, plans, rescale, with_lpips)
+    return _scored(cells, [replace(pairs, size=size) for pairs in plans], rescale, with_lpips)
 
 
 def score_input_light(
@@ -75,6 +87,7 @@ def score_input_light(
     rescale: Rescale = "median",
     every: int = 1,
     with_lpips: bool = False,
+    size: int | None = None,
     input_light: str = INPUT_LIGHT,
 ) -> dict[str, Any]:
     """The scores of not relighting: the true test views under the input light stand in for every target
@@ -89,7 +102,7 @@ def score_input_light(
         views = _with_truth(root, scene, light, every)
         paths = [view.image(input_light) for view in views]
         plans.append(PairsOnDisk(root / scene, light, [view.name for view in views], paths))
-    return _scored(cells, plans, rescale, with_lpips)
+    return _scored(cells, [replace(pairs, size=size) for pairs in plans], rescale, with_lpips)
 
 
 def _cells(scenes: Sequence[str], lights: Sequence[str], every: int) -> list[tuple[str, str]]:
@@ -145,6 +158,10 @@ def _scored(
         say(LPIPS_ABSENT)
     scores = [_score(pairs, rescale, lpips) for pairs in track(plans, "score")]
     return _as_json(cells, scores, rescale)
+
+
+def _with_alpha(image: np.ndarray) -> np.ndarray:
+    return image if image.shape[-1] == 4 else np.dstack([image, np.ones_like(image[..., 0])])
 
 
 def _score(pairs: PairsOnDisk, rescale: Rescale, lpips: ImageMetric | None) -> LightScores:
