@@ -115,9 +115,7 @@ class ConvPyramid(nn.Sequential):
         widths = config.widths
         first = in_channels * config.patch**2
         # Unshuffled pixels already see their neighbours: a 1x1 stem keeps small models cheap.
-        stem = (
-            nn.Conv2d(first, widths[0], 3, 1, 1) if config.patch == 1 else nn.Conv2d(first, widths[0], 1)
-        )
+        stem = nn.Conv2d(first, widths[0], 3, 1, 1) if config.patch == 1 else nn.Conv2d(first, widths[0], 1)
         layers: list[nn.Module] = [nn.PixelUnshuffle(config.patch)] if config.patch > 1 else []
         layers += [_flax_default(stem), nn.SiLU()]
         for width, next_width in zip(widths[:-1], widths[1:], strict=True):
@@ -200,9 +198,7 @@ class TextureNetwork(nn.Module):
         offset, gain = maps.chunk(2, 1)
         return functional.softplus(offset + gain * rgb.repeat(1, NUM_CUE_CHANNELS // 3, 1, 1), beta=8.0)
 
-    def forward(
-        self, masked_image: Float[Tensor, "batch 4 height width"]
-    ) -> Float[Tensor, "batch 12 height width"]:
+    def forward(self, masked_image: Float[Tensor, "batch 4 height width"]) -> Float[Tensor, "batch 12 height width"]:
         return self.texture(self.maps(masked_image), masked_image[:, :3])
 
 

@@ -74,9 +74,7 @@ def put_back(
     image = piece.new_zeros(piece.shape[0], height, width)
     rows = slice(max(0, top), min(height, top + side))
     columns = slice(max(0, left), min(width, left + side))
-    image[:, rows, columns] = piece[
-        :, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left
-    ]
+    image[:, rows, columns] = piece[:, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
     return image
 
 

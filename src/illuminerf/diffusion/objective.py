@@ -49,9 +49,7 @@ def stratified_timesteps(batch: int, generator: torch.Generator) -> Int[Tensor, 
     return (offsets[torch.randperm(batch, generator=generator)] * NUM_TRAIN_TIMESTEPS).long()
 
 
-def anchor_loss(
-    products: Float[Tensor, "batch 12 height width"], batch: Batch
-) -> Float[Tensor, ""]:
+def anchor_loss(products: Float[Tensor, "batch 12 height width"], batch: Batch) -> Float[Tensor, ""]:
     """Mean squared sRGB error of the composited products over covered pixels.
 
     Only where the target is saturated may the products be brighter than 1 for free.

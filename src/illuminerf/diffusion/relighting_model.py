@@ -120,9 +120,7 @@ class RelightingModel(nn.Module):
         self, noisy_latent: Tensor, timesteps: Int[Tensor, " batch"], condition: Condition
     ) -> Float[Tensor, "batch channels rows columns"]:
         """Predict v = alpha_t noise - sigma_t latent (Salimans and Ho, 2022)."""
-        down, middle = self.control(
-            noisy_latent, timesteps, condition.tokens, condition.embedding, return_dict=False
-        )
+        down, middle = self.control(noisy_latent, timesteps, condition.tokens, condition.embedding, return_dict=False)
         text = self.empty_text.expand(len(noisy_latent), -1, -1)
         return self.base(
             noisy_latent,
@@ -179,9 +177,7 @@ def save_model(model: RelightingModel, folder: Path, half: bool = False) -> None
     state = model.state_dict()
     for part, prefix in _PARTS.items():
         tensors = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
-        save_checkpoint(
-            folder / part / _WEIGHTS, {k: v.half() if half else v for k, v in tensors.items()}, {}
-        )
+        save_checkpoint(folder / part / _WEIGHTS, {k: v.half() if half else v for k, v in tensors.items()}, {})
     write_json(folder / "relighting_model.json", to_json(model.config))
 
 

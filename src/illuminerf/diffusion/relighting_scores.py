@@ -114,9 +114,7 @@ def evaluate(
     }
     truth, alpha = batch.target, batch.alpha
     scores = {name: _scores(image, truth, alpha) for name, image in images.items()}
-    each = torch.stack(
-        [masked_psnr(rescaled(drawn[:, k], truth), truth, alpha) for k in range(num_samples)]
-    )
+    each = torch.stack([masked_psnr(rescaled(drawn[:, k], truth), truth, alpha) for k in range(num_samples)])
     scores["sample"] = {"psnr": float(each.mean())}
     scores["best"] = {"psnr": float(each.max(0).values.mean())}
     deviation = drawn.std(1) if num_samples > 1 else torch.zeros_like(truth)

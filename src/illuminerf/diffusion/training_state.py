@@ -44,9 +44,7 @@ def save_training(
     save_checkpoint(path, tensors | optimizer_tensors(optimizer), {"step": step})
 
 
-def restore_training(
-    path: Path, model: nn.Module, average: WeightAverage, optimizer: torch.optim.Optimizer
-) -> int:
+def restore_training(path: Path, model: nn.Module, average: WeightAverage, optimizer: torch.optim.Optimizer) -> int:
     """Put back what `save_training` wrote; returns the number of finished steps."""
     tensors, metadata = load_checkpoint(path)
     model.load_state_dict(_under("model.", tensors))

@@ -1,6 +1,6 @@
 """RelightingPairs -> RelightingModel (paper, supplement, "Relighting Diffusion Model").
 
-Batches derive from (seed, step, process) alone, so an interrupted run goes on exactly where it stopped. The run grows in
+Batches derive from (seed, step, process) alone, so an interrupted run goes on exactly where it stopped. It grows in
 phases: resolution and terms of the loss change at fixed steps (small models on few cores learn most at 64 pixels).
 The folder of items may still be growing: it is listed again at every checkpoint.
 """

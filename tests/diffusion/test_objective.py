@@ -1,0 +1,72 @@
+"""The loss: zero for the truth, v by hand, learnable."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from illuminerf.diffusion.augmentation import AugmentationConfig, make_batch
+from illuminerf.diffusion.cue_coding import encode_cues
+from illuminerf.diffusion.objective import Batch, LossWeights, anchor_loss, training_loss
+from illuminerf.diffusion.training_items import load_items
+from illuminerf.diffusion.training_state import WeightAverage, learning_rate
+from illuminerf.scene.images import srgb_from_linear
+from tests.diffusion.tiny import tiny_model, write_items
+
+
+def lambertian_batch(brightness: float = 0.4) -> tuple[torch.Tensor, Batch]:
+    torch.manual_seed(0)
+    lobes = brightness * torch.rand(2, 4, 3, 16, 16)
+    alpha = (torch.rand(2, 1, 16, 16) > 0.3).float()
+    target = srgb_from_linear(lobes.sum(1)).clamp_max(1) * alpha
+    products = encode_cues(lobes.flatten(1, 2))
+    return products, Batch(torch.cat([target, alpha], 1), products, target, alpha)
+
+
+def test_anchor_loss_is_zero_for_the_truth_and_by_hand_otherwise() -> None:
+    products, batch = lambertian_batch()
+    assert float(anchor_loss(products, batch)) < 1e-8
+    grey = batch._replace(target=(batch.target + 0.1) * batch.alpha)
+    assert float(anchor_loss(products, grey)) == pytest.approx(0.01, rel=1e-3)
+
+
+def test_brighter_than_saturated_is_free_but_brighter_than_the_truth_is_not() -> None:
+    products, batch = lambertian_batch(brightness=3.0)
+    assert (batch.target == 1).any()
+    assert float(anchor_loss(products, batch)) < 1e-6
+    darker = batch._replace(target=0.9 * batch.target)
+    assert float(anchor_loss(products, darker)) > 1e-3
+
+
+def test_learning_rate_by_hand() -> None:
+    rates = [learning_rate(step, 2.0, 4, 100, 0.5) for step in (0, 1, 3, 40, 50, 75, 99)]
+    assert rates == pytest.approx([0.5, 1.0, 2.0, 2.0, 2.0, 1.0, 0.04])
+
+
+def test_weight_average_by_hand() -> None:
+    model = torch.nn.Linear(1, 1)
+    average = WeightAverage(model, decay=0.5)
+    start = float(average.tensors["weight"])
+    with torch.no_grad():
+        model.weight.add_(1.0)
+    average.update(model, step=100)
+    assert float(average.tensors["weight"]) == pytest.approx(start + 0.5)
+
+
+@pytest.mark.parametrize("with_diffusion", [False, True])
+def test_a_few_steps_lower_the_loss(tmp_path: Path, with_diffusion: bool) -> None:
+    items = load_items(write_items(tmp_path), 32)
+    model = tiny_model().train()
+    optimizer = torch.optim.Adam(model.parameters(), 3e-3)
+    weights = LossWeights(diffusion=float(with_diffusion))
+    losses = []
+    for step in range(40):
+        generator = torch.Generator().manual_seed(step % 4)
+        batch = make_batch(items, 8, AugmentationConfig(composited_share=0), generator)
+        loss, parts = training_loss(model, batch, generator, weights, scale_momentum=0.1 if step < 4 else 0)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        losses.append(float(loss.detach()))
+    assert set(parts) == ({"anchor", "diffusion"} if with_diffusion else {"anchor"})
+    assert sum(losses[-4:]) < 0.7 * sum(losses[:4])

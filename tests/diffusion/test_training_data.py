@@ -1,0 +1,127 @@
+"""Items and augmentations: exact for light transport, deterministic."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from illuminerf.diffusion.augmentation import (
+    AugmentationConfig,
+    interpolated_specular,
+    make_batch,
+    plain_example,
+    stack_examples,
+)
+from illuminerf.diffusion.cue_coding import decode_cues
+from illuminerf.diffusion.relighting_scores import held_out_pairs, masked_psnr, masked_ssim, rescaled, true_composite
+from illuminerf.diffusion.training_items import diffuse_level, load_items
+from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
+from illuminerf.workflow.checkpoint import load_checkpoint, save_checkpoint
+from illuminerf.workflow.errors import UserError
+from tests.diffusion.tiny import write_items
+
+EXACT = AugmentationConfig(composited_share=0.0)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_items(tmp_path)
+
+
+def relation_error(batch: object) -> float:
+    """The discs obey target = albedo * diffuse + 0.04 * gloss: how far from it, for the best albedo per channel."""
+    cues = decode_cues(batch.coded_cues).unflatten(1, (4, 3))  # type: ignore[attr-defined]
+    target = linear_from_srgb(batch.target / batch.alpha.clamp_min(1e-3))  # type: ignore[attr-defined]
+    inside = (batch.alpha > 0.99) & (batch.target < 0.99)  # type: ignore[attr-defined]
+    diffuse = (target - 0.04 * cues[:, 3]) / cues[:, 0].clamp_min(1e-3)
+    count = inside.sum((2, 3), keepdim=True).clamp_min(1)
+    mean = (diffuse * inside).sum((2, 3), keepdim=True) / count
+    return float(((diffuse - mean).abs() * inside).max())
+
+
+def test_mixtures_tints_shuffles_and_flips_keep_light_transport(folder: Path) -> None:
+    items = load_items(folder, 32)
+    batch = make_batch(items, 24, EXACT, torch.Generator().manual_seed(0))
+    assert relation_error(batch) < 0.02
+    wrong = batch._replace(coded_cues=batch.coded_cues.roll(1, 1))  # channels out of step
+    assert relation_error(wrong) > 0.1
+
+
+def test_composited_materials_differ_from_the_render(folder: Path) -> None:
+    items = load_items(folder, 32)
+    batch = make_batch(items, 24, AugmentationConfig(composited_share=1.0), torch.Generator().manual_seed(0))
+    assert all(torch.isfinite(tensor).all() for tensor in batch)
+    assert relation_error(batch) > 0.05
+
+
+def test_same_generator_same_batch(folder: Path) -> None:
+    items = load_items(folder, 32)
+    batches = [make_batch(items, 4, AugmentationConfig(), torch.Generator().manual_seed(s)) for s in (3, 3, 4)]
+    assert all(torch.equal(a, b) for a, b in zip(batches[0], batches[1], strict=True))
+    assert not torch.equal(batches[0].target, batches[2].target)
+
+
+def test_input_and_target_come_from_different_lights(folder: Path) -> None:
+    items = load_items(folder, 32)
+    batch = make_batch(items, 16, AugmentationConfig(mixture_share=0, composited_share=0, exposure=0), torch.Generator())
+    difference = (batch.masked_image[:, :3] - batch.target).abs().amax((1, 2, 3))
+    assert (difference > 0.01).all()
+
+
+def test_items_are_straight_and_averaged_exactly(folder: Path) -> None:
+    item = load_items(folder, 32)[0]
+    small = load_items(folder, 16)[0]
+    tensors, _ = load_checkpoint(folder / "items" / "disc0_0.safetensors")
+    torch.testing.assert_close((item.targets * item.alpha).float(), tensors["targets"].float(), atol=2e-3, rtol=0)
+    energy = torch.nn.functional.avg_pool2d(tensors["targets"].float(), 2)
+    torch.testing.assert_close((small.targets * small.alpha).float(), energy, atol=3e-3, rtol=0)
+
+
+def test_plain_examples_are_exposed_alike(folder: Path) -> None:
+    image, cues, target, alpha = plain_example(load_items(folder, 32)[0], 0, 2)
+    assert float(diffuse_level(cues, alpha)) == pytest.approx(0.55, rel=1e-2)
+    batch = stack_examples([(image, cues, target, alpha)])
+    assert batch.masked_image.shape == (1, 4, 32, 32)
+    assert float(batch.masked_image.max()) <= 1
+
+
+def test_specular_interpolation_meets_the_cues_at_their_roughness() -> None:
+    lobes = torch.rand(4, 3, 5, 5)
+    for roughness, lobe in ((0.0, 1), (0.05, 1), (0.13, 2), (0.34, 3), (0.9, 0)):
+        torch.testing.assert_close(interpolated_specular(lobes, torch.tensor(roughness)), lobes[lobe])
+    between = interpolated_specular(lobes, torch.tensor((0.13 + 0.34) / 2))
+    torch.testing.assert_close(between, (lobes[2] + lobes[3]) / 2)
+
+
+def test_bound_by_true_materials_is_nearly_exact_on_the_discs(folder: Path) -> None:
+    item = load_items(folder, 32)[0]
+    _, cues, target, alpha = plain_example(item, 0, 1)
+    truth, ours = (srgb_from_linear(x).clamp_max(1)[None] * alpha for x in (target, true_composite(item, cues)))
+    assert float(masked_psnr(rescaled(ours, truth), truth, alpha[None])) > 35
+    assert float(masked_psnr(rescaled(truth.roll(5, 2), truth), truth, alpha[None])) < 30
+
+
+def test_scores_by_hand() -> None:
+    truth, alpha = torch.full((1, 3, 16, 16), 0.5), torch.ones(1, 1, 16, 16)
+    assert float(masked_psnr(truth + 0.1, truth, alpha)) == pytest.approx(20.0, abs=1e-3)
+    textured = 0.2 + 0.6 * torch.rand(1, 3, 16, 16)
+    assert float(masked_ssim(textured, textured, alpha)) == pytest.approx(1.0, abs=1e-5)
+    assert float(masked_ssim(textured, textured.flip(-1), alpha)) < 0.7
+    dim = srgb_from_linear(0.3 * linear_from_srgb(textured) * torch.tensor([1.0, 0.5, 0.8])[:, None, None])
+    torch.testing.assert_close(rescaled(dim, textured), textured, atol=1e-4, rtol=0)
+
+
+def test_held_out_pairs_are_spread_and_never_relight_to_the_same_light(folder: Path) -> None:
+    pairs = held_out_pairs(load_items(folder, 32), 12)
+    assert len({pair[0].name for pair in pairs}) == 3
+    assert all(first != second for _, first, second in pairs)
+
+
+def test_bad_folders_are_user_errors(tmp_path: Path, folder: Path) -> None:
+    with pytest.raises(UserError, match="holds no training items"):
+        load_items(tmp_path / "nothing", 32)
+    with pytest.raises(UserError, match="multiple of 24"):
+        load_items(folder, 24)
+    save_checkpoint(tmp_path / "odd" / "a.safetensors", {"targets": torch.zeros(4, 3, 8, 8)}, {})
+    with pytest.raises(UserError, match="lacks"):
+        load_items(tmp_path / "odd", 8)
