@@ -94,8 +94,8 @@ class MitsubaScene:
         sensor, parameters = self._sensors[height, width]
         fx, _, cx, cy = cameras.intrinsics[view]
         parameters["x_fov"] = float(np.degrees(2 * np.arctan(0.5 * width / fx)))
-        parameters["principal_point_offset_x"] = float(cx / width - 0.5)
-        parameters["principal_point_offset_y"] = float(cy / height - 0.5)
+        parameters["principal_point_offset_x"] = float(0.5 - cx / width)
+        parameters["principal_point_offset_y"] = float(0.5 - cy / height)
         parameters["to_world"] = mi.ScalarTransform4f(cameras.world_from_camera[view] @ _OPENGL_FROM_MITSUBA)
         parameters.update()
         return sensor

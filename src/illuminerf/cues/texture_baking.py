@@ -93,8 +93,9 @@ def _sampled(image: np.ndarray, uv: np.ndarray, footprint: float) -> np.ndarray:
         channels = [np.asarray(Image.fromarray(np.ascontiguousarray(c)).reduce(factor)) for c in channels]
     small = np.stack(channels, -1)
     height, width = small.shape[:2]
-    x = uv[:, 0] * width - 0.5
-    y = (1 - uv[:, 1]) * height - 0.5
+    # where the factor does not divide the size, the last texel averages fewer
+    x = uv[:, 0] * (image.shape[1] / factor) - 0.5
+    y = (1 - uv[:, 1]) * (image.shape[0] / factor) - 0.5
     x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     tx, ty = (x - x0)[:, None], (y - y0)[:, None]
     texel = lambda row, column: small[row % height, column % width]  # noqa: E731

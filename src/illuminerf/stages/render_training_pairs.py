@@ -116,7 +116,7 @@ def run(models: Path, lights: Path, config: Config, out: Path) -> Path:
                     if reason:
                         quarantined[path.stem] = reason
                         say(f"quarantined {path.stem}: {reason}")
-                progress.advance(quarantined=len(quarantined))
+                progress.advance(quarantined=float(len(quarantined)))
         items = sorted(item.stem for item in (out / "items").glob("*.safetensors"))
         write_json(out / "manifest.json", {"items": items, "quarantined": dict(sorted(quarantined.items()))})
         artefact.finish({"num_items": len(items), "num_quarantined": len(quarantined)})
