@@ -11,27 +11,34 @@ from PIL import Image
 from illuminerf.cues.materials import Material
 from illuminerf.scene.meshes import TriangleMesh
 
-_MAX_ROUNDS = 9
-_FACES_PER_SQUARED_EDGE = 6.0  # how many faces a unit of area takes when split to a longest edge of 1
+_MAX_ROUNDS = 40
+_COARSER = 1.2
 
 
 def baked(
-    parts: list[tuple[TriangleMesh, Material]], max_edge: float = 0.025, max_faces: int = 100_000
+    parts: list[tuple[TriangleMesh, Material]], max_edge: float = 0.03, max_faces: int = 40_000
 ) -> list[tuple[TriangleMesh, Material]]:
     """Replace textured parts by finely split ones with per-vertex values.
 
     Args:
         parts: meshes with materials, in the unit sphere.
-        max_edge: longest edge of textured faces after splitting, world units; a pixel or two.
-        max_faces: edges are let grow so that about this many faces come out.
+        max_edge: longest edge of textured faces after splitting, world units; about two pixels.
+        max_faces: edges are let grow until about this many faces come out, or no face is split.
     """
-    area = sum(_area(mesh) for mesh, material in parts if material.is_textured)
-    edge = max(max_edge, float(np.sqrt(_FACES_PER_SQUARED_EDGE * area / max_faces)))
-    return [_baked_part(mesh, material, edge) if material.is_textured else (mesh, material) for mesh, material in parts]
+    textured = [mesh.vertices[mesh.faces] for mesh, material in parts if material.is_textured]
+    if not textured:
+        return parts
+    corners = np.concatenate(textured)
+    num_whole = len(corners)
+    while _predicted_faces(corners, max_edge) > max(max_faces, 1.2 * num_whole):
+        max_edge *= _COARSER
+    return [
+        _baked_part(mesh, material, max_edge) if material.is_textured else (mesh, material) for mesh, material in parts
+    ]
 
 
 def split_to_edge(corners: np.ndarray, max_edge: float) -> np.ndarray:
-    """Split triangles at their edges' middles until no edge is longer than `max_edge`.
+    """Halve triangles across their longest edge until no edge is longer than `max_edge`.
 
     Args:
         corners: [faces, 3, channels]; the first three channels are the position, the rest is interpolated along.
@@ -42,17 +49,33 @@ def split_to_edge(corners: np.ndarray, max_edge: float) -> np.ndarray:
     """
     done = []
     for _ in range(_MAX_ROUNDS):
-        edges = corners[:, [1, 2, 0], :3] - corners[:, :, :3]
-        is_long = np.linalg.norm(edges, axis=-1).max(1) > max_edge
+        lengths = _edge_lengths(corners)
+        is_long = lengths.max(1) > max_edge
         done.append(corners[~is_long])
         corners = corners[is_long]
         if not len(corners):
             break
-        a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-        quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-        corners = np.concatenate([np.stack(quarter, 1) for quarter in quarters])
+        # turn each triangle so that its longest edge is a-b
+        first = lengths[is_long].argmax(1)
+        order = (first[:, None] + np.arange(3)) % 3
+        turned = np.take_along_axis(corners, order[..., None], 1)
+        a, b, c = turned[:, 0], turned[:, 1], turned[:, 2]
+        middle = (a + b) / 2
+        corners = np.concatenate([np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)])
     return np.concatenate([*done, corners])
+
+
+def _edge_lengths(corners: np.ndarray) -> np.ndarray:
+    """Lengths of the edges that start at each corner [faces, 3]."""
+    return np.linalg.norm(corners[:, [1, 2, 0], :3] - corners[:, :, :3], axis=-1)
+
+
+def _predicted_faces(corners: np.ndarray, max_edge: float) -> float:
+    """Roughly how many faces `split_to_edge` makes: by area, but slivers by length."""
+    a, b, c = corners[:, 0, :3], corners[:, 1, :3], corners[:, 2, :3]
+    by_area = np.linalg.norm(np.cross(b - a, c - a), axis=-1) / 2 / (0.12 * max_edge**2)
+    by_length = _edge_lengths(corners).max(1) / max_edge
+    return float(np.maximum(np.maximum(by_area, by_length), 1).sum())
 
 
 def _area(mesh: TriangleMesh) -> float:
