@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import binary_erosion
 
-from illuminerf.data.developing import plain_background_mask, straight_srgb_uint8
+from illuminerf.data.developing import plain_background_mask, shrunk, straight_srgb_uint8
 from illuminerf.data.distortion import distorted, undistorted_image
 from illuminerf.data.resampling import area_downsampled, area_weights, padded, padding_to
 from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
@@ -117,3 +117,12 @@ def test_plain_backgrounds_are_those_connected_to_the_border() -> None:
     np.testing.assert_array_equal(mask, wanted)
     np.testing.assert_array_equal(plain_background_mask(1 - srgb, "black"), wanted)
     assert plain_background_mask(srgb, "black").all()
+
+
+def test_shrinking_is_that_of_the_importer_and_never_enlarges() -> None:
+    straight = np.round(GENERATOR.uniform(size=(8, 12, 4)) * 255).astype(np.float32) / 255
+    linear = np.concatenate([linear_from_srgb(straight[..., :3]) * straight[..., 3:], straight[..., 3:]], -1)
+    np.testing.assert_array_equal(
+        np.round(shrunk(straight, 6) * 255), straight_srgb_uint8(area_downsampled(linear, 4, 6))
+    )
+    assert shrunk(straight, 12) is straight

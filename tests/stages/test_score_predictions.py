@@ -9,7 +9,7 @@ import pytest
 from illuminerf.data.tensoir import find_views, load_test_image
 from illuminerf.evaluation.benchmark_rule import ViewPair, on_white, score_light
 from illuminerf.evaluation.published import GALLERY
-from illuminerf.scene.images import write_png
+from illuminerf.scene.images import linear_from_srgb, read_png, srgb_from_linear, write_png
 from illuminerf.stages.score_predictions import score_input_light, score_predictions
 from illuminerf.workflow.errors import UserError
 
@@ -110,6 +110,19 @@ def test_predictions_without_a_matching_name(benchmark: Path, tmp_path: Path) ->
 def test_sizes_must_agree(benchmark: Path, tmp_path: Path) -> None:
     write_png(tmp_path / "ours" / "mug" / "lamp" / "test_000.png", np.zeros((8, 8, 3)))
     with pytest.raises(UserError, match="8 x 8 pixels.*wanted 16 x 16"):
+        score_predictions(benchmark, tmp_path / "ours", ["mug"], ["lamp"])
+
+
+def test_larger_images_are_averaged_down(benchmark: Path, tmp_path: Path) -> None:
+    predict(benchmark, tmp_path / "ours", "lamp")
+    for number in NUMBERS:  # a checker whose mean is the truth's, in linear light
+        path = tmp_path / "ours" / "mug" / "lamp" / f"test_{number:03d}.png"
+        linear = linear_from_srgb(read_png(path)).repeat(2, 0).repeat(2, 1)
+        sign = np.indices(linear.shape[:2]).sum(0)[..., None] % 2 * 2 - 1
+        swing = 0.5 * np.minimum(linear, 1 - linear)
+        write_png(path, srgb_from_linear(linear + sign * swing))
+    assert score_predictions(benchmark, tmp_path / "ours", ["mug"], ["lamp"], size=16)["mean"]["psnr"] > 48
+    with pytest.raises(UserError, match="32 x 32"):
         score_predictions(benchmark, tmp_path / "ours", ["mug"], ["lamp"])
 
 
