@@ -1,5 +1,7 @@
 """Where the object can be: the unit ball, and inside it the cells that no mask rules out."""
 
+from typing import no_type_check
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -76,7 +78,8 @@ class OccupiedCells:
 
 
 @njit(inline="always")
-def _occupied(cells, origin, direction, distance):  # type: ignore[no-untyped-def]
+@no_type_check
+def _occupied(cells, origin, direction, distance):
     side = cells.shape[0]
     half = np.float32(side / 2)
     x = int((origin[0] + distance * direction[0]) * half + half)
@@ -86,9 +89,8 @@ def _occupied(cells, origin, direction, distance):  # type: ignore[no-untyped-de
 
 
 @njit(parallel=True, cache=True)
-def _march_kernel(  # type: ignore[no-untyped-def]
-    cells, origins, directions, near, far, steps, first, last
-):
+@no_type_check
+def _march_kernel(cells, origins, directions, near, far, steps, first, last):
     for ray in prange(len(near)):
         first[ray], last[ray] = 0, -1
         if far[ray] <= near[ray]:
@@ -124,7 +126,8 @@ def visual_hull(cameras: Cameras, alpha: np.ndarray, side: int) -> Bool[Tensor, 
     for view in range(len(cameras)):
         candidates = np.flatnonzero(inside)
         image_points, depth = cameras[view].project(points[candidates])
-        reach = 0.87 * (2 / side) * cameras.intrinsics[view, 0] / np.maximum(depth[0].mean(), 1e-6)
+        nearest = max(float(depth[0].min(initial=1e6)), 0.1)
+        reach = 0.87 * (2 / side) * cameras.intrinsics[view, 0] / nearest + 1
         mask = alpha[view] > 0.5
         grown = ndimage.distance_transform_edt(~mask) <= reach
         column, row = np.floor(image_points[0]).astype(int).T

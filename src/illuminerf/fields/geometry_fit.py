@@ -72,8 +72,9 @@ def geometry_loss(
     anywhere = torch.rand(len(index), 3, generator=generator, device=device) * 1.6 - 0.8
     gradients = torch.cat([samples.gradients.view(-1, 3), field.surface(anywhere, levels).gradient])
 
-    colour = losses.colour_loss(srgb, target_srgb[index])
-    total = colour + config.eikonal * losses.eikonal_loss(gradients)
+    # Charbonnier as in camp_zipnerf: against the squared error's ever smaller gradient the smoothness terms win
+    squared = losses.colour_loss(srgb.detach(), target_srgb[index])
+    total = losses.robust_colour_loss(srgb, target_srgb[index]) + config.eikonal * losses.eikonal_loss(gradients)
     total = total + interlevel_loss(samples.edges, samples.weights, samples.proposal_edges, samples.proposal_weights)
     rays = len(index)
     total = total + config.orientation * losses.orientation_loss(
@@ -86,7 +87,7 @@ def geometry_loss(
     if target_alpha is not None:
         opacity = samples.weights.sum(-1)
         total = total + config.mask * losses.mask_loss(opacity, target_alpha[index])
-    numbers = {"psnr": losses.psnr(colour.detach()), "beta": float(field.surface.beta.detach())}
+    numbers = {"psnr": losses.psnr(squared), "beta": float(field.surface.beta.detach())}
     return total, numbers
 
 
@@ -117,7 +118,7 @@ def start_from_cells(
         loss = (point.signed_distance - target.view(-1)[cell]).abs().mean()
         loss = loss + 0.01 * losses.eikonal_loss(point.gradient)
         optimiser.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimiser.step()
     for parameter in parameters:
         parameter.grad = None

@@ -4,6 +4,8 @@ Forward runs in parallel over positions. Backward runs in parallel over levels: 
 no two threads write to the same place, and every sum has one fixed order.
 """
 
+from typing import no_type_check
+
 import numpy as np
 import torch
 from numba import njit, prange
@@ -15,7 +17,8 @@ _PRIME_Z = 805459861
 
 
 @njit(inline="always")
-def _cell(position, resolution, half):  # type: ignore[no-untyped-def]
+@no_type_check
+def _cell(position, resolution, half):
     # constants would promote float32 to float64 (slower, and cells that differ from the twin's), so none appear
     scaled = min(max(position * half + half, half - half), half + half)
     floor = min(np.floor(scaled), half + half)
@@ -26,7 +29,8 @@ def _cell(position, resolution, half):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _entry(x, y, z, resolution, size, offset):  # type: ignore[no-untyped-def]
+@no_type_check
+def _entry(x, y, z, resolution, size, offset):
     side = resolution + 1
     if side * side * side <= size:
         return offset + x + side * (y + side * z)
@@ -34,9 +38,8 @@ def _entry(x, y, z, resolution, size, offset):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True)
-def _forward(  # type: ignore[no-untyped-def]
-    positions, table, resolutions, sizes, offsets, halves, features, jacobian, with_jacobian
-):
+@no_type_check
+def _forward(positions, table, resolutions, sizes, offsets, halves, features, jacobian, with_jacobian):
     num_features = table.shape[1]
     for n in prange(positions.shape[0]):
         for level in range(len(resolutions)):
@@ -74,9 +77,8 @@ def _forward(  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True)
-def _backward(  # type: ignore[no-untyped-def]
-    positions, table_grad, resolutions, sizes, offsets, halves, features_grad, jacobian_grad, with_jacobian
-):
+@no_type_check
+def _backward(positions, table_grad, resolutions, sizes, offsets, halves, features_grad, jacobian_grad, with_jacobian):
     num_features = table_grad.shape[1]
     for level in prange(len(resolutions)):
         resolution, size, offset, half = resolutions[level], sizes[level], offsets[level], halves[level]
@@ -142,7 +144,7 @@ class KernelInterpolation(torch.autograd.Function):
         return features, jacobian
 
     @staticmethod
-    def backward(ctx, features_grad: Tensor, jacobian_grad: Tensor):  # type: ignore[no-untyped-def, override]
+    def backward(ctx, features_grad: Tensor, jacobian_grad: Tensor):  # type: ignore[no-untyped-def]
         """Gradient of the table."""
         (positions,) = ctx.saved_tensors
         table_grad = torch.zeros(ctx.table_shape, dtype=positions.dtype)

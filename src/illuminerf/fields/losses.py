@@ -15,6 +15,11 @@ def colour_loss(srgb: Float[Tensor, "rays 3"], target_srgb: Float[Tensor, "rays 
     return ((srgb - target_srgb) ** 2).mean()
 
 
+def robust_colour_loss(srgb: Float[Tensor, "rays 3"], target_srgb: Float[Tensor, "rays 3"]) -> Float[Tensor, ""]:
+    """Charbonnier distance sqrt(error^2 + 0.001^2) in premultiplied sRGB, mean over rays and channels."""
+    return torch.sqrt((srgb - target_srgb) ** 2 + 1e-6).mean()
+
+
 def eikonal_loss(gradient: Float[Tensor, "points 3"]) -> Float[Tensor, ""]:
     """Mean over points of (|gradient| - 1)^2."""
     return ((gradient.norm(dim=-1) - 1) ** 2).mean()

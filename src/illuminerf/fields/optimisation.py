@@ -86,7 +86,7 @@ def fit(
             if not math.isfinite(float(loss.detach())):
                 raise FloatingPointError(f"the loss is {float(loss.detach())} at step {step} of {description}")
             optimiser.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             optimiser.step()
             if (step + 1) % config.checkpoint_every == 0 and step + 1 < config.num_steps:
                 tensors = {f"parameter.{name}": p for name, p in parameters.items()}

@@ -37,7 +37,7 @@ class RayPool:
     def __len__(self) -> int:
         return len(self.view)
 
-    def draw(self, num_rays: int, generator: torch.Generator, foreground_share: float = 0.85) -> Int[Tensor, " batch"]:
+    def draw(self, num_rays: int, generator: torch.Generator, foreground_share: float = 0.75) -> Int[Tensor, " batch"]:
         """Random rays, a fixed share of them foreground where there are both kinds."""
         num_background = len(self) - self.num_foreground
         num_chosen = num_rays if not num_background else math.ceil(num_rays * foreground_share)

@@ -1,0 +1,98 @@
+"""What a frozen geometry says about every pixel, computed once: shading points, weights and normals.
+
+All samples of a view share these, so that a step of the latent NeRF evaluates appearance only.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from illuminerf.fields import losses
+from illuminerf.fields.radiance_field import RadianceField, ShadingPoints
+from illuminerf.fields.ray_pool import RayPool
+from illuminerf.workflow.progress import track
+
+_CHUNK = 4096
+
+
+@dataclass
+class ShadingCache:
+    """The heaviest samples of each ray.
+
+    Attributes:
+        directions: float32 [rays, 3].
+        positions: float32 [rays, kept, 3].
+        weights: float32 [rays, kept]; scaled so that they sum to the opacity of the whole ray.
+        normals: float32 [rays, kept, 3], those that the radiance fields see.
+    """
+
+    directions: Float[Tensor, "rays 3"]
+    positions: Float[Tensor, "rays kept 3"]
+    weights: Float[Tensor, "rays kept"]
+    normals: Float[Tensor, "rays kept 3"]
+
+    def render(
+        self,
+        field: RadianceField,
+        index: Int[Tensor, " batch"],
+        latents: Float[Tensor, "batch latent"] | None = None,
+    ) -> Float[Tensor, "batch 3"]:
+        """Colours (premultiplied sRGB) of the chosen rays; differentiable in appearance and latents."""
+        weights = self.weights[index]
+        ray, kept = (weights > field.config.min_weight).nonzero().unbind(-1)
+        source = index[ray]
+        normals = self.normals[source, kept]
+        points = ShadingPoints(ray, self.positions[source, kept], weights[ray, kept], normals)
+        return field.shade(points, normals, self.directions[index], latents)
+
+
+@torch.no_grad()
+def cache_shading(field: RadianceField, pool: RayPool, num_kept: int) -> ShadingCache:
+    """Sample the frozen surface along the foreground rays of a pool.
+
+    Deviation: the paper renders all samples at every step. The kept ones hold nearly all weight once beta is small.
+
+    Args:
+        num_kept: heaviest samples to keep per ray.
+    """
+    parts: list[tuple[Tensor, ...]] = []
+    num_kept = min(num_kept, field.config.num_samples)
+    chunks = torch.arange(pool.num_foreground, device=pool.view.device).split(_CHUNK)
+    for index in track(chunks, "find shading points", math.ceil(pool.num_foreground / _CHUNK)):
+        origins, directions, near, far = pool.rays(index)
+        samples = field.sample(origins, directions, near, far)
+        weights, chosen = samples.weights.topk(num_kept, dim=-1)
+        weights = weights * (samples.weights.sum(-1) / weights.sum(-1).clamp_min(1e-8))[:, None]
+        spread = chosen[..., None].expand(-1, -1, 3)
+        positions = samples.positions.gather(1, spread)
+        flat = ShadingPoints(
+            chosen.reshape(-1),
+            positions.reshape(-1, 3),
+            weights.reshape(-1),
+            torch.nn.functional.normalize(samples.gradients.gather(1, spread), dim=-1, eps=1e-6).reshape(-1, 3),
+        )
+        _, normals = field.shading_normals(flat)
+        parts.append((directions, positions, weights, normals.view_as(positions)))
+    return ShadingCache(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
+
+
+def latent_loss(
+    field: RadianceField,
+    cache: ShadingCache,
+    index: Int[Tensor, " batch"],
+    target_srgb: Float[Tensor, "batch 3"],
+    latents: Float[Tensor, "batch latent"] | None,
+    latent_penalty: float,
+) -> tuple[Tensor, dict[str, float]]:
+    """Equation 7 of the paper on one batch.
+
+    Deviation: a small penalty on the squared latents keeps the zero code, which is rendered at test, in their midst.
+    """
+    colour = losses.colour_loss(cache.render(field, index, latents), target_srgb)
+    total = colour
+    if latents is not None:
+        total = total + latent_penalty * latents.square().sum(-1).mean()
+    return total, {"psnr": losses.psnr(colour.detach())}

@@ -1,0 +1,179 @@
+"""RelitViews + Geometry -> LatentNerf: one 3D appearance that explains all relit samples through latent codes."""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from illuminerf.data.capture import load_capture
+from illuminerf.fields.optimisation import OptimiserConfig, fit
+from illuminerf.fields.radiance_field import RadianceField
+from illuminerf.fields.ray_pool import RayPool, gather_rays
+from illuminerf.fields.shading_cache import ShadingCache, cache_shading, latent_loss
+from illuminerf.fields.storage import StoredField, load_field, save_field
+from illuminerf.scene.images import read_png, to_uint8
+from illuminerf.workflow.artefact import open_artefact
+from illuminerf.workflow.device import resolve_device, torch_generator
+from illuminerf.workflow.errors import UserError
+
+
+@dataclass(frozen=True)
+class Config:
+    """The latent NeRF (section 3.3, supplement A.1); the defaults are the embedded preset."""
+
+    optimiser: OptimiserConfig = field(
+        default_factory=lambda: OptimiserConfig(num_steps=3000, rays_per_step=1024, warmup_steps=60)
+    )
+    """Steps, rays, learning rates."""
+    num_kept: int = 4
+    """Heaviest samples of each ray that are shaded."""
+    use_latents: bool = True
+    """One latent code per relit image; False is the paper's ablation, a standard NeRF."""
+    latent_penalty: float = 1e-4
+    """Weight of the mean squared norm of the latent codes."""
+    seed: int = 0
+    """Seed of latents, network and batches."""
+    device: str = "auto"
+    """auto, cpu or cuda."""
+
+    def __post_init__(self) -> None:
+        if self.num_kept < 1 or self.latent_penalty < 0:
+            raise UserError("num_kept must be positive and latent_penalty not negative", got=str(self))
+
+    @classmethod
+    def paper(cls) -> "Config":
+        """The paper's settings."""
+        return cls(optimiser=OptimiserConfig.paper(), num_kept=16, latent_penalty=0.0)
+
+
+class _LatentNerf(nn.Module):
+    """What is optimised: the appearance of a field whose geometry is frozen, and the latent codes."""
+
+    def __init__(self, radiance_field: RadianceField, num_images: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.appearance = radiance_field.appearance
+        width = radiance_field.config.appearance.latent_width
+        codes = 0.01 * torch.randn(num_images, width, generator=generator)
+        self.latents = nn.Parameter(codes.to(next(self.appearance.parameters()).device))
+
+
+def run(geometry_path: Path, capture_path: Path, relit_path: Path, config: Config, out: Path) -> Path:
+    """Distil relit samples into a latent NeRF.
+
+    Raises:
+        UserError: samples are missing or do not fit the capture, or the geometry has no latent conditioning.
+    """
+    inputs: dict[str, Path | str] = {
+        "geometry": geometry_path,
+        "capture": capture_path,
+        "relit": relit_path,
+    }
+    with open_artefact(out, "fit_latent_nerf", config, inputs) as artefact:
+        if artefact.is_done:
+            return out
+        device = resolve_device(config.device)
+        stored = load_field(geometry_path, device)
+        if config.use_latents and stored.field.config.appearance.latent_width < 1:
+            raise UserError(
+                "this geometry's field has no room for latent codes",
+                got="latent_width 0",
+                fix="fit the geometry with latent_width of at least 1, or set use_latents to false",
+            )
+        views = load_capture(capture_path).views
+        sample_views, num_samples = find_samples(relit_path, len(views))
+        pool = gather_rays(views.cameras[sample_views], views.alpha[sample_views], stored.cells, device)
+        targets = _targets(relit_path, pool, sample_views, num_samples)
+        cache = cache_shading(stored.field, pool, config.num_kept)
+        generator = torch_generator(config.seed, "latents")
+        model = _LatentNerf(stored.field, len(sample_views) * num_samples, generator)
+        psnr = _fit(model, stored.field, cache, pool, targets, config, out / "checkpoint.safetensors")
+        latents = model.latents.detach() if config.use_latents else None
+        save_field(out, StoredField(stored.field, stored.cells, latents))
+        (out / "checkpoint.safetensors").unlink(missing_ok=True)
+        artefact.finish({"num_views": len(sample_views), "num_samples": num_samples, "train_psnr": psnr})
+    return out
+
+
+def find_samples(relit_path: Path, num_views: int) -> tuple[list[int], int]:
+    """Views that have relit samples, and how many each has.
+
+    Raises:
+        UserError: there are none, some views have fewer than others, or a view is not one of the capture.
+    """
+    found: dict[int, set[int]] = {}
+    for path in sorted((relit_path / "samples").glob("*.png")):
+        if match := re.fullmatch(r"(\d+)_(\d+)\.png", path.name):
+            found.setdefault(int(match[1]), set()).add(int(match[2]))
+    if not found:
+        raise UserError(f"{relit_path} holds no relit samples", wanted="samples/<view>_<sample>.png")
+    views, num_samples = sorted(found), max(len(samples) for samples in found.values())
+    for view in views:
+        if found[view] != set(range(num_samples)):
+            raise UserError(
+                f"view {view} of {relit_path} lacks relit samples",
+                got=f"{len(found[view])}",
+                wanted=f"{num_samples}, numbered from 0",
+                fix="run relight_views again; it goes on where it stopped",
+            )
+    if views[-1] >= num_views:
+        raise UserError(
+            f"{relit_path} was not made from this capture",
+            got=f"a sample of view {views[-1]}",
+            wanted=f"views 0 to {num_views - 1}",
+        )
+    return views, num_samples
+
+
+def _fit(
+    model: _LatentNerf,
+    radiance_field: RadianceField,
+    cache: ShadingCache,
+    pool: RayPool,
+    targets: Tensor,
+    config: Config,
+    checkpoint: Path,
+) -> float:
+    """Optimise; returns the PSNR over the last steps."""
+    device = cache.weights.device
+    num_samples, recent = len(targets), [0.0]
+
+    def step_loss(step: int) -> tuple[Tensor, dict[str, float]]:
+        generator = torch_generator(config.seed, "latent nerf", step, device=device)
+        size = (config.optimiser.rays_per_step,)
+        index = torch.randint(pool.num_foreground, size, generator=generator, device=device)
+        sample = torch.randint(num_samples, size, generator=generator, device=device)
+        target = targets[sample, index].float() / 255
+        latents = None
+        if config.use_latents:
+            latents = functional.embedding(pool.view[index] * num_samples + sample, model.latents)
+        loss, numbers = latent_loss(radiance_field, cache, index, target, latents, config.latent_penalty)
+        share = 0.98 if step else 0.0
+        recent[0] = share * recent[0] + (1 - share) * numbers["psnr"]
+        return loss, {"psnr": recent[0]}
+
+    fit(model, config.optimiser, step_loss, checkpoint, "fit latent NeRF")
+    return recent[0]
+
+
+def _targets(relit_path: Path, pool: RayPool, views: list[int], num_samples: int) -> Tensor:
+    """The samples' colours at the pool's foreground rays: uint8 [samples, rays, 3], premultiplied sRGB."""
+    height, width = pool.cameras.height, pool.cameras.width
+    targets = torch.empty(num_samples, pool.num_foreground, 3, dtype=torch.uint8)
+    of_ray, pixel = pool.view[: pool.num_foreground].cpu(), pool.pixel[: pool.num_foreground].cpu()
+    for number, view in enumerate(views):
+        rays = (of_ray == number).nonzero()[:, 0]
+        for sample in range(num_samples):
+            path = relit_path / "samples" / f"{view:03d}_{sample:02d}.png"
+            image = read_png(path)
+            if image.shape[:2] != (height, width):
+                raise UserError(
+                    f"{path} has another size than the capture",
+                    got=f"{image.shape[1]} x {image.shape[0]}",
+                    wanted=f"{width} x {height}",
+                )
+            flat = torch.from_numpy(to_uint8(image[..., :3]).reshape(-1, 3))
+            targets[sample, rays] = flat[pixel[rays]]
+    return targets.to(pool.view.device)

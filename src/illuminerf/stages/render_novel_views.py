@@ -1,0 +1,129 @@
+"""LatentNerf + cameras -> NovelViews: images from new sides under the target light."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from illuminerf.fields.image_rendering import render_image
+from illuminerf.fields.storage import StoredField, load_field
+from illuminerf.scene.cameras import Cameras, turntable_cameras
+from illuminerf.scene.images import linear_from_srgb, write_exr, write_png
+from illuminerf.workflow.artefact import open_artefact
+from illuminerf.workflow.atomic import read_json, write_json
+from illuminerf.workflow.device import resolve_device
+from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.progress import track
+
+
+@dataclass(frozen=True)
+class TurntableConfig:
+    """Cameras on a circle around the object, used where no camera file is given."""
+
+    num_views: int = 48
+    """Frames of one turn."""
+    radius: float = 3.0
+    """Distance to the centre, in radii of the unit ball."""
+    fov_radians: float = 0.7
+    """Horizontal field of view."""
+    elevation_radians: float = 0.5
+    """Height above the horizon."""
+    height: int = 200
+    """Image height in pixels."""
+    width: int = 200
+    """Image width in pixels."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """How novel views are rendered."""
+
+    turntable: TurntableConfig = field(default_factory=TurntableConfig)
+    """Cameras where no camera file is given."""
+    latent_index: int | None = None
+    """Which training image's latent code to render; None is the zero code, as in the paper's results."""
+    num_samples: int | None = None
+    """Samples per ray; None is as in training."""
+    rays_per_chunk: int = 8192
+    """Rays at a time, which bounds memory."""
+    device: str = "auto"
+    """auto, cpu or cuda."""
+
+    def __post_init__(self) -> None:
+        if self.rays_per_chunk < 1 or (self.num_samples is not None and self.num_samples < 2):
+            raise UserError("rays per chunk and samples per ray must be positive", got=str(self))
+
+
+def run(latent_nerf_path: Path, cameras_path: Path | None, config: Config, out: Path) -> Path:
+    """Render a fitted field: a latent NeRF under its target light, or a geometry's own appearance (the input light).
+
+    Args:
+        latent_nerf_path: a LatentNerf or a Geometry artefact.
+        cameras_path: a cameras.json (or a folder with one) in the capture's unit-ball world; None for the turntable.
+        config: the settings.
+        out: the NovelViews artefact: images/<view>.png (straight sRGB, alpha), linear/<view>.exr (linear radiance
+            premultiplied, A), cameras.json.
+
+    Raises:
+        UserError: the field or the cameras cannot be read, or there is no such latent code.
+    """
+    if cameras_path is not None and cameras_path.is_dir():
+        cameras_path = cameras_path / "cameras.json"
+    inputs: dict[str, Path | str] = {
+        "field": latent_nerf_path,
+        "cameras": "turntable" if cameras_path is None else cameras_path,
+    }
+    with open_artefact(out, "render_novel_views", config, inputs) as artefact:
+        if artefact.is_done:
+            return out
+        stored = load_field(latent_nerf_path, resolve_device(config.device))
+        if config.num_samples is not None:
+            stored.field.config = replace(stored.field.config, num_samples=config.num_samples)
+        latent = _latent(stored, config.latent_index)
+        cameras = _cameras(cameras_path, config.turntable)
+        for view in track(range(len(cameras)), "render novel views"):
+            if not _paths(out, view)[1].exists():
+                _render_view(stored, cameras, view, latent, config.rays_per_chunk, out)
+        write_json(out / "cameras.json", cameras.to_dict())
+        artefact.finish({"num_views": len(cameras)})
+    return out
+
+
+def _paths(out: Path, view: int) -> tuple[Path, Path]:
+    """Image and linear image of a view; the second is written last."""
+    return out / "images" / f"{view:03d}.png", out / "linear" / f"{view:03d}.exr"
+
+
+def _render_view(
+    stored: StoredField, cameras: Cameras, view: int, latent: torch.Tensor | None, chunk: int, out: Path
+) -> None:
+    image = render_image(stored.field, stored.cells, cameras, view, latent, chunk)
+    alpha = image.alpha[..., None]
+    straight = np.clip(np.where(alpha > 1e-3, image.srgb / np.maximum(alpha, 1e-3), 0), 0, 1)
+    png, exr = _paths(out, view)
+    write_png(png, np.concatenate([straight, alpha], -1))
+    linear = linear_from_srgb(straight.astype(np.float32)) * alpha
+    write_exr(exr, {name: linear[..., i] for i, name in enumerate("RGB")} | {"A": image.alpha})
+
+
+def _latent(stored: StoredField, index: int | None) -> torch.Tensor | None:
+    if index is None:
+        return None
+    count = 0 if stored.latents is None else len(stored.latents)
+    if stored.latents is None or not 0 <= index < count:
+        raise UserError(f"there is no latent code {index}", wanted=f"0 to {count - 1}" if count else "none")
+    return stored.latents[index]
+
+
+def _cameras(path: Path | None, turntable: TurntableConfig) -> Cameras:
+    if path is not None:
+        return Cameras.from_dict(read_json(path))
+    return turntable_cameras(
+        turntable.num_views,
+        turntable.radius,
+        turntable.fov_radians,
+        turntable.height,
+        turntable.width,
+        turntable.elevation_radians,
+    )

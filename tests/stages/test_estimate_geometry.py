@@ -1,0 +1,133 @@
+"""A tiny fit of an analytic sphere: its mesh is that sphere, and an interrupted fit ends in the same bytes."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from illuminerf.fields import optimisation
+from illuminerf.fields.appearance import AppearanceConfig
+from illuminerf.fields.geometry_fit import GeometryLossConfig
+from illuminerf.fields.hash_grid import HashGridConfig
+from illuminerf.fields.optimisation import OptimiserConfig
+from illuminerf.fields.proposal_sampling import ProposalConfig
+from illuminerf.fields.radiance_field import FieldConfig
+from illuminerf.fields.storage import load_field
+from illuminerf.fields.surface import SurfaceConfig
+from illuminerf.scene.meshes import TriangleMesh
+from illuminerf.stages import estimate_geometry
+from illuminerf.workflow.artefact import read_metrics
+from illuminerf.workflow.config import from_json, to_json
+from illuminerf.workflow.errors import UserError
+
+_GRID = HashGridConfig(5, 2, 12, 8, 48)
+CONFIG = estimate_geometry.Config(
+    radiance_field=FieldConfig(
+        SurfaceConfig(_GRID, 32, HashGridConfig(4, 2, 11, 8, 32), 16),
+        AppearanceConfig(_GRID, 8, 32, 1, 2, 4, 16),
+        ProposalConfig(HashGridConfig(3, 2, 10, 8, 24), 8),
+        num_proposal_samples=16,
+        num_samples=10,
+    ),
+    optimiser=OptimiserConfig(num_steps=200, rays_per_step=128, warmup_steps=10, checkpoint_every=60),
+    losses=GeometryLossConfig(first_levels=2),
+    occupancy_side=32,
+    mesh_resolution=48,
+    num_held_out_views=1,
+    num_previews=1,
+    device="cpu",
+)
+
+
+@pytest.fixture(scope="module")
+def geometry(sphere_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return estimate_geometry.run(sphere_capture, CONFIG, tmp_path_factory.mktemp("fit") / "geometry")
+
+
+def test_mesh_is_the_sphere(geometry: Path) -> None:
+    mesh = TriangleMesh.load_glb(geometry / "mesh.glb")
+    radius = np.linalg.norm(mesh.vertices, axis=-1)
+    assert abs(np.median(radius) - 0.6) < 0.02
+    assert np.quantile(np.abs(radius - 0.6), 0.95) < 0.05
+    outward = mesh.vertices / radius[:, None]
+    assert np.median((mesh.vertex_normals * outward).sum(-1)) > 0.95
+    corners = mesh.vertices[mesh.faces]
+    winding = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.mean((winding * corners.mean(1)).sum(-1) > 0) > 0.99
+
+
+def test_held_out_view_is_reproduced(geometry: Path) -> None:
+    assert read_metrics(geometry)["held_out_psnr"] > 19
+
+
+def test_files(geometry: Path) -> None:
+    names = {path.name for path in geometry.iterdir()}
+    assert {"field.safetensors", "field.json", "mesh.glb", "normals", "DONE"} <= names
+    assert "checkpoint.safetensors" not in names
+    assert (geometry / "normals" / "000.png").is_file()
+
+
+@pytest.mark.parametrize("killed_at", [30, 61])
+def test_a_killed_fit_goes_on_to_the_same_bytes(
+    geometry: Path, sphere_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_at: int
+) -> None:
+    out, learning_rate = tmp_path / "geometry", OptimiserConfig.learning_rate
+
+    def dies(self: OptimiserConfig, step: int) -> float:
+        if step == killed_at:
+            raise KeyboardInterrupt
+        return learning_rate(self, step)
+
+    monkeypatch.setattr(optimisation.OptimiserConfig, "learning_rate", dies)
+    with pytest.raises(KeyboardInterrupt):
+        estimate_geometry.run(sphere_capture, CONFIG, out)
+    assert not (out / "DONE").exists()
+    assert (out / "checkpoint.safetensors").exists() == (killed_at > 60)
+    monkeypatch.undo()
+    estimate_geometry.run(sphere_capture, CONFIG, out)
+    for name in ("field.safetensors", "mesh.glb", "normals/000.png"):
+        assert (out / name).read_bytes() == (geometry / name).read_bytes(), name
+    assert (out / "DONE").read_text() == (geometry / "DONE").read_text()
+
+
+def test_another_seed_is_another_field(geometry: Path, sphere_capture: Path, tmp_path: Path) -> None:
+    """The guard of the byte comparison."""
+    few = replace(CONFIG.optimiser, num_steps=3)
+    fields = []
+    for seed in (0, 1):
+        config = replace(CONFIG, seed=seed, optimiser=few)
+        out = estimate_geometry.run(sphere_capture, config, tmp_path / str(seed))
+        fields.append((out / "field.safetensors").read_bytes())
+    assert fields[0] != fields[1]
+
+
+def test_stored_field_has_tight_cells(geometry: Path) -> None:
+    stored = load_field(geometry)
+    assert bool(stored.cells.contains(torch.tensor([[0.58, 0, 0], [0.0, -0.58, 0]])).all())
+    assert not bool(stored.cells.contains(torch.tensor([[0.9, 0, 0], [0.0, 0.0, 0.95]])).any())
+
+
+def test_configs_survive_json_and_refuse_nonsense() -> None:
+    for config in (CONFIG, estimate_geometry.Config(), estimate_geometry.Config.paper()):
+        assert from_json(estimate_geometry.Config, to_json(config)) == config
+    with pytest.raises(UserError):
+        replace(CONFIG, mesh_resolution=1)
+    with pytest.raises(UserError):
+        OptimiserConfig(num_steps=0)
+
+
+def test_learning_rate_warms_up_and_decays() -> None:
+    paper = OptimiserConfig.paper()
+    assert paper.learning_rate(0) < 1e-5
+    assert paper.learning_rate(500) == pytest.approx(5e-3, rel=0.05)
+    assert paper.learning_rate(24_999) == pytest.approx(5e-4)
+    assert paper.learning_rate(12_500) == pytest.approx((5e-3 * 5e-4) ** 0.5, rel=1e-3)
+
+
+def test_a_corrupt_field_is_explained(geometry: Path, tmp_path: Path) -> None:
+    (tmp_path / "field.json").write_bytes((geometry / "field.json").read_bytes())
+    (tmp_path / "field.safetensors").write_bytes((geometry / "field.safetensors").read_bytes()[:1000])
+    with pytest.raises(UserError):
+        load_field(tmp_path)

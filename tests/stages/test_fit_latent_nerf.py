@@ -1,0 +1,145 @@
+"""Latent NeRF on samples that disagree: codes explain the disagreement, the zero code is in its midst."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from illuminerf.data.capture import load_capture
+from illuminerf.fields import optimisation
+from illuminerf.fields.appearance import AppearanceConfig
+from illuminerf.fields.hash_grid import HashGridConfig
+from illuminerf.fields.optimisation import OptimiserConfig
+from illuminerf.fields.proposal_sampling import ProposalConfig
+from illuminerf.fields.radiance_field import FieldConfig
+from illuminerf.fields.surface import SurfaceConfig
+from illuminerf.scene.images import read_png, write_png
+from illuminerf.stages import estimate_geometry, fit_latent_nerf, render_novel_views
+from illuminerf.workflow.artefact import read_metrics
+from illuminerf.workflow.errors import UserError
+
+_GRID = HashGridConfig(5, 2, 12, 8, 48)
+_GEOMETRY = estimate_geometry.Config(
+    radiance_field=FieldConfig(
+        SurfaceConfig(_GRID, 32, HashGridConfig(4, 2, 11, 8, 32), 16),
+        AppearanceConfig(_GRID, 8, 32, 1, 2, 4, 16),
+        ProposalConfig(HashGridConfig(3, 2, 10, 8, 24), 8),
+        num_proposal_samples=16,
+        num_samples=10,
+    ),
+    optimiser=OptimiserConfig(num_steps=120, rays_per_step=128, warmup_steps=10),
+    occupancy_side=32,
+    mesh_resolution=32,
+    num_held_out_views=0,
+    num_previews=0,
+    device="cpu",
+)
+CONFIG = fit_latent_nerf.Config(
+    optimiser=OptimiserConfig(num_steps=250, rays_per_step=256, warmup_steps=10, checkpoint_every=100),
+    device="cpu",
+)
+_GAINS = (0.6, 1.0, 1.4)
+
+
+@pytest.fixture(scope="module")
+def geometry(sphere_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return estimate_geometry.run(sphere_capture, _GEOMETRY, tmp_path_factory.mktemp("fit") / "geometry")
+
+
+@pytest.fixture(scope="module")
+def relit(sphere_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three samples per view that differ in brightness."""
+    folder = tmp_path_factory.mktemp("relit")
+    for view, image in enumerate(load_capture(sphere_capture).views.premultiplied()):
+        for sample, gain in enumerate(_GAINS):
+            write_png(folder / "samples" / f"{view:03d}_{sample:02d}.png", np.clip(0.6 * gain * image, 0, 1))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def latent_nerf(geometry: Path, sphere_capture: Path, relit: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("latent") / "nerf"
+    return fit_latent_nerf.run(geometry, sphere_capture, relit, CONFIG, out)
+
+
+def test_codes_explain_what_one_appearance_cannot(
+    geometry: Path, sphere_capture: Path, relit: Path, latent_nerf: Path, tmp_path: Path
+) -> None:
+    plain = replace(CONFIG, use_latents=False)
+    without = fit_latent_nerf.run(geometry, sphere_capture, relit, plain, tmp_path / "plain")
+    assert read_metrics(latent_nerf)["train_psnr"] > read_metrics(without)["train_psnr"] + 3
+
+
+def _brightness(field: Path, sphere_capture: Path, latent_index: int | None, out: Path) -> float:
+    config = render_novel_views.Config(latent_index=latent_index, device="cpu")
+    render_novel_views.run(field, sphere_capture, config, out)
+    image = read_png(out / "images" / "000.png")
+    return float(image[image[..., 3] > 0.9, :3].mean())
+
+
+def test_zero_code_lies_between_the_samples(
+    latent_nerf: Path, sphere_capture: Path, relit: Path, tmp_path: Path
+) -> None:
+    dark, middle, bright = (
+        _brightness(latent_nerf, sphere_capture, index, tmp_path / str(index)) for index in (0, None, 2)
+    )
+    assert dark + 0.05 < middle < bright - 0.05
+    sample = read_png(relit / "samples" / "000_00.png")
+    assert abs(dark - sample[sample.max(-1) > 0].mean()) < 0.05
+
+
+def test_geometry_is_untouched(geometry: Path, latent_nerf: Path) -> None:
+    from illuminerf.fields.storage import load_field
+
+    before, after = load_field(geometry), load_field(latent_nerf)
+    for name, value in before.field.surface.state_dict().items():
+        assert bool((value == after.field.surface.state_dict()[name]).all()), name
+    old, new = before.field.appearance.grid.table, after.field.appearance.grid.table
+    assert not bool((old == new).all())
+    assert after.latents is not None and after.latents.shape == (36, 4)
+
+
+def test_a_killed_fit_goes_on_to_the_same_bytes(
+    geometry: Path,
+    sphere_capture: Path,
+    relit: Path,
+    latent_nerf: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    learning_rate = OptimiserConfig.learning_rate
+
+    def dies(self: OptimiserConfig, step: int) -> float:
+        if step == 130:
+            raise KeyboardInterrupt
+        return learning_rate(self, step)
+
+    monkeypatch.setattr(optimisation.OptimiserConfig, "learning_rate", dies)
+    out = tmp_path / "nerf"
+    with pytest.raises(KeyboardInterrupt):
+        fit_latent_nerf.run(geometry, sphere_capture, relit, CONFIG, out)
+    assert (out / "checkpoint.safetensors").exists()
+    monkeypatch.undo()
+    fit_latent_nerf.run(geometry, sphere_capture, relit, CONFIG, out)
+    assert (out / "DONE").read_text() == (latent_nerf / "DONE").read_text()
+
+
+def test_missing_and_misfit_samples_are_named(
+    geometry: Path, sphere_capture: Path, relit: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match="no relit samples"):
+        fit_latent_nerf.run(geometry, sphere_capture, tmp_path, CONFIG, tmp_path / "none" / "out")
+    partial = tmp_path / "partial"
+    shutil.copytree(relit, partial)
+    (partial / "samples" / "003_01.png").unlink()
+    with pytest.raises(UserError, match="view 3"):
+        fit_latent_nerf.find_samples(partial, 12)
+    with pytest.raises(UserError, match="not made from this capture"):
+        fit_latent_nerf.find_samples(relit, 5)
+    small = tmp_path / "small"
+    shutil.copytree(relit, small)
+    write_png(small / "samples" / "000_00.png", np.zeros((8, 8, 3), np.float32))
+    with pytest.raises(UserError, match="another size"):
+        fit_latent_nerf.run(geometry, sphere_capture, small, CONFIG, tmp_path / "out")
