@@ -133,6 +133,7 @@ CASES: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
 @pytest.mark.parametrize("name", CASES)
 def test_bad_input_is_explained_and_leaves_nothing(tmp_path: Path, name: str) -> None:
     root = tmp_path / "source"

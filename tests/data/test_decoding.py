@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from illuminerf.data.decoding import EXIF_ORIENTATION, image_size, read_linear_premultiplied, read_straight
+from illuminerf.data.decoding import EXIF_ORIENTATION, image_size, read_straight
 from illuminerf.data.deep_png import _unfiltered, read_deep_png
 from illuminerf.scene.images import linear_from_srgb, write_exr
 from illuminerf.workflow.errors import UserError
@@ -154,32 +154,27 @@ def test_poses_for_the_stored_orientation_keep_it(tmp_path: Path) -> None:
     assert read_straight(tmp_path / "photo.jpg", (24, 40)).shape == (40, 24, 4)
 
 
-def test_linear_values_are_premultiplied(tmp_path: Path) -> None:
-    Image.fromarray(RGBA).save(tmp_path / "image.png")
-    values = RGBA.astype(np.float64) / 255
-    wanted = linear_from_srgb(values[..., :3]) * values[..., 3:]
-    pixels = read_linear_premultiplied(tmp_path / "image.png")
-    np.testing.assert_allclose(pixels[..., :3], wanted, atol=1e-6)
-    assert np.abs(pixels[..., :3] - values[..., :3] * values[..., 3:]).max() > 0.05
-
-
-def test_exr_is_linear_and_its_alpha_optional(tmp_path: Path) -> None:
-    planes = {name: GENERATOR.uniform(size=(4, 5)).astype(np.float32) for name in "RGB"}
+def test_exr_is_linear_premultiplied_and_its_alpha_optional(tmp_path: Path) -> None:
+    planes = {name: GENERATOR.uniform(0, 2, size=(4, 5)).astype(np.float32) for name in "RGB"}
+    linear = np.stack([planes[name] for name in "RGB"], -1)
     write_exr(tmp_path / "a.exr", planes, half=False)
-    pixels = read_linear_premultiplied(tmp_path / "a.exr")
-    np.testing.assert_array_equal(pixels[..., :3], np.stack([planes[name] for name in "RGB"], -1))
+    pixels = read_straight(tmp_path / "a.exr")
+    np.testing.assert_allclose(linear_from_srgb(pixels[..., :3]), linear, atol=1e-5)
     assert (pixels[..., 3] == 1).all() and image_size(tmp_path / "a.exr") == (5, 4)
     write_exr(tmp_path / "b.exr", {"Y": planes["R"]}, half=False)
-    np.testing.assert_array_equal(read_linear_premultiplied(tmp_path / "b.exr")[..., 2], planes["R"])
+    np.testing.assert_allclose(linear_from_srgb(read_straight(tmp_path / "b.exr")[..., 2]), planes["R"], atol=1e-5)
+    quarter = {**{name: plane * 0.25 for name, plane in planes.items()}, "A": np.full((4, 5), 0.25, np.float32)}
+    write_exr(tmp_path / "c.exr", quarter, half=False)
+    np.testing.assert_allclose(read_straight(tmp_path / "c.exr")[..., :3], pixels[..., :3], atol=1e-5)
 
 
 def test_spoilt_exr(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", {"depth": np.ones((4, 5), np.float32)})
     with pytest.raises(UserError, match="lacks colour"):
-        read_linear_premultiplied(tmp_path / "a.exr")
+        read_straight(tmp_path / "a.exr")
     write_exr(tmp_path / "b.exr", {name: np.full((4, 5), np.nan, np.float32) for name in "RGB"})
     with pytest.raises(UserError, match="not finite"):
-        read_linear_premultiplied(tmp_path / "b.exr")
+        read_straight(tmp_path / "b.exr")
     (tmp_path / "c.exr").write_bytes(b"v/1\x01 nothing more")
     with pytest.raises(UserError, match="cannot be read"):
         image_size(tmp_path / "c.exr")

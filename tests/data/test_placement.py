@@ -94,8 +94,8 @@ def test_placement_maps_the_ball_to_the_unit_ball() -> None:
 
 
 def test_previews_keep_every_marked_pixel() -> None:
-    alpha = np.zeros((801, 1203), np.float32)
-    alpha[800, 1202] = alpha[0, 0] = alpha[400, 7] = 1
-    small = mask_preview(alpha)
+    mask = np.zeros((801, 1203), bool)
+    mask[800, 1202] = mask[0, 0] = mask[400, 7] = True
+    small = mask_preview(mask)
     assert max(small.shape) <= 200 and small.sum() == 3 and small[0, 0] and small[-1, -1]
-    np.testing.assert_array_equal(mask_preview(alpha[:50, :50]), alpha[:50, :50] > 0.5)
+    np.testing.assert_array_equal(mask_preview(mask[:50, :50]), mask[:50, :50])

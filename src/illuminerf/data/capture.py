@@ -5,7 +5,9 @@ cameras.json          `Cameras.to_dict()`, in the unit ball's world
 images/<000>.png      8-bit sRGB, straight RGBA; all of one size, undistorted
 """
 
+import os
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -102,7 +104,8 @@ def load_capture(folder: Path) -> Capture:
     num_views = len(cameras)
     srgb = np.empty((num_views, cameras.height, cameras.width, 3), np.float32)
     alpha = np.empty((num_views, cameras.height, cameras.width), np.float32)
-    for view in range(num_views):
+
+    def read(view: int) -> None:
         image = read_png(image_path(folder, view))
         if image.shape != (cameras.height, cameras.width, 4):
             raise UserError(
@@ -112,6 +115,9 @@ def load_capture(folder: Path) -> Capture:
                 fix="import the capture again into a new folder",
             )
         srgb[view], alpha[view] = image[..., :3], image[..., 3]
+
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:  # decoding leaves the interpreter's lock
+        list(pool.map(read, range(num_views)))
     try:
         return Capture(
             Views(cameras, srgb, alpha),

@@ -1,4 +1,4 @@
-"""Decoding of one source image to premultiplied linear RGB with alpha, whatever file it comes from.
+"""Decoding of one source image to straight sRGB with alpha, whatever file it comes from.
 
 Display-referred files (PNG of 8 or 16 bits, JPEG, WebP, TIFF, BMP; grey, palette or colour) hold sRGB with
 straight alpha; EXR holds linear RGB, premultiplied. CMYK is refused: without its profile its colours are a
@@ -6,7 +6,6 @@ guess.
 """
 
 import struct
-import warnings
 import zlib
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import OpenEXR
 from PIL import Image
 
 from illuminerf.data.deep_png import is_deep_colour_png, read_deep_png
-from illuminerf.scene.images import linear_from_srgb, read_exr
+from illuminerf.scene.images import read_exr, srgb_from_linear
 from illuminerf.workflow.errors import UserError
 
 MAX_PIXELS = 120_000_000
@@ -49,9 +48,7 @@ def _check_size(path: Path, width: int, height: int) -> None:
 def _open(path: Path) -> Image.Image:
     """An image whose header is read and whose size is sane; its pixels are not decoded yet."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit here is MAX_PIXELS
-            image = Image.open(path)
+        image = Image.open(path)
     except Image.DecompressionBombError as error:
         raise UserError(
             "an image has an impossible size",
@@ -79,7 +76,7 @@ def _orientation(path: Path, image: Image.Image) -> int:
 
 
 def image_size(path: Path, declared: tuple[int, int] | None = None) -> tuple[int, int]:
-    """(width, height) as `read_linear_premultiplied` returns it, from the header alone."""
+    """(width, height) as `read_straight` returns it, from the header alone."""
     if path.suffix.lower() == ".exr":
         try:
             with OpenEXR.File(str(path), header_only=True) as file:
@@ -96,21 +93,7 @@ def image_size(path: Path, declared: tuple[int, int] | None = None) -> tuple[int
     return width, height
 
 
-def read_linear_premultiplied(path: Path, declared: tuple[int, int] | None = None) -> np.ndarray:
-    """float32 [height, width, 4]: linear RGB times alpha, and alpha, both in [0, 1] (EXR: RGB unclipped).
-
-    An EXIF orientation is applied, so that the image stands upright; where `declared`, the (width, height)
-    that the poses were estimated for, equals the stored size of a sideways image, it is left as stored.
-    """
-    _check_size(path, *image_size(path, declared))
-    if path.suffix.lower() == ".exr":
-        return _read_exr_premultiplied(path)
-    straight = read_straight(path, declared)
-    linear = linear_from_srgb(straight[..., :3]) * straight[..., 3:]
-    return np.concatenate([linear, straight[..., 3:]], axis=-1).astype(np.float32)
-
-
-def _read_exr_premultiplied(path: Path) -> np.ndarray:
+def _read_exr_straight(path: Path) -> np.ndarray:
     try:
         channels = read_exr(path)
     except _DECODING_ERRORS as error:
@@ -121,17 +104,25 @@ def _read_exr_premultiplied(path: Path) -> np.ndarray:
         raise UserError(
             "an EXR image lacks colour", got=f"channels {sorted(channels)} in {path}", wanted="R, G, B [, A]"
         )
-    alpha = channels.get("A", np.ones_like(rgb[0]))
-    stacked = np.stack([*rgb, np.clip(alpha, 0, 1)], axis=-1).astype(np.float32)
-    if not np.isfinite(stacked).all():
+    alpha = np.clip(channels.get("A", np.ones_like(rgb[0])), 0, 1)[..., None]
+    premultiplied = np.maximum(np.stack(rgb, axis=-1), 0)
+    if not (np.isfinite(premultiplied).all() and np.isfinite(alpha).all()):
         raise UserError(
             "an image holds values that are not finite", got=f"NaN or infinity in {path}", wanted="finite RGB"
         )
-    return np.maximum(stacked, 0)
+    linear_rgb = np.where(alpha > 0, premultiplied / np.maximum(alpha, 1e-6), 0)
+    return np.concatenate([srgb_from_linear(linear_rgb), alpha], axis=-1).astype(np.float32)
 
 
 def read_straight(path: Path, declared: tuple[int, int] | None = None) -> np.ndarray:
-    """float32 [height, width, 4] in [0, 1]: sRGB and straight alpha of a display-referred file."""
+    """float32 [height, width, 4] in [0, 1]: sRGB and straight alpha; of an EXR the sRGB is unclipped.
+
+    An EXIF orientation is applied, so that the image stands upright; where `declared`, the (width, height)
+    that the poses were estimated for, equals the stored size of a sideways image, it is left as stored.
+    """
+    _check_size(path, *image_size(path, declared))
+    if path.suffix.lower() == ".exr":
+        return _read_exr_straight(path)
     with _open(path) as image:
         if image.mode in ("CMYK", "LAB", "F"):
             raise UserError(

@@ -1,6 +1,7 @@
 """From a source frame to the pixels of a capture: alpha, undistortion, size, straight 8-bit sRGB.
 
-Everything between decoding and quantising happens on linear premultiplied RGBA, where averages are right.
+Wherever pixels are mixed (undistortion, change of size) they are linear and premultiplied, where averages
+are right.
 """
 
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy import ndimage
 
-from illuminerf.data.decoding import read_linear_premultiplied, read_straight
+from illuminerf.data.decoding import read_straight
 from illuminerf.data.distortion import undistorted_image
 from illuminerf.data.resampling import area_downsampled, padded, padding_to
 from illuminerf.data.source import SourceCapture, SourceFrame
@@ -75,29 +76,34 @@ def plain_background_mask(srgb: np.ndarray, background: PlainBackground) -> np.n
 def develop(
     frame: SourceFrame, size: tuple[int, int], common: tuple[int, int], background: PlainBackground | None
 ) -> np.ndarray:
-    """float32 [height, width, 4], linear premultiplied, undistorted, of the `common` size.
+    """uint8 [height, width, 4], straight sRGB, undistorted, of the `common` size (width, height).
 
     Alpha is that of the image times the mask; where there is neither and a plain `background` is named, it
     is cut out.
     """
     camera = frame.camera
-    declared = (camera.width, camera.height)
-    rgba = read_linear_premultiplied(frame.image, declared)
-    if rgba.shape[:2] != declared[::-1]:
-        raise UserError("an image changed while it was read", got=str(rgba.shape[:2][::-1]), wanted=str(declared))
+    stored = (camera.width, camera.height)
+    straight = read_straight(frame.image, stored)
+    if straight.shape[:2] != stored[::-1]:
+        raise UserError("an image changed while it was read", got=str(straight.shape[:2][::-1]), wanted=str(stored))
+    srgb, alpha = straight[..., :3], straight[..., 3]
     if frame.mask is not None:
-        rgba = rgba * _read_mask(frame)[..., None]
-    elif background is not None and rgba[..., 3].min() == 1.0:
-        rgba = rgba * plain_background_mask(srgb_from_linear(rgba[..., :3]), background)[..., None]
-    if rgba[..., 3].max() < 0.5:
+        alpha = alpha * _read_mask(frame)
+    elif background is not None and alpha.min() == 1.0:
+        alpha = alpha * plain_background_mask(srgb, background)
+    if alpha.max() < 0.5:
         raise UserError(
             "a view shows nothing of the object",
             got=f"an empty mask for {frame.mask or frame.image}",
             wanted="a mask that is white on the object",
             fix="correct the mask, or remove the view",
         )
+    if size == stored and not any(camera.distortion):  # no pixel is mixed with another: linear light is not needed
+        pixels = to_uint8(np.concatenate([srgb, alpha[..., None]], axis=-1))
+        return padded(pixels * (pixels[..., 3:] > 0), common)
+    rgba = np.concatenate([linear_from_srgb(srgb) * alpha[..., None], alpha[..., None]], axis=-1)
     rgba = undistorted_image(rgba, (camera.fx, camera.fy, camera.cx, camera.cy), camera.distortion)
-    return padded(area_downsampled(rgba, size[1], size[0]), common)
+    return padded(straight_srgb_uint8(area_downsampled(rgba, size[1], size[0])), common)
 
 
 def _read_mask(frame: SourceFrame) -> np.ndarray:

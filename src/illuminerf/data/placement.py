@@ -147,18 +147,14 @@ def _carve(cameras: Cameras, masks: Sequence[np.ndarray], ball: Ball) -> tuple[n
     return points[enough & (hit >= seen - np.floor(MAX_DISAGREEING * seen))], step
 
 
-def mask_preview(alpha: np.ndarray, longest_side: int = 200) -> np.ndarray:
-    """bool, at most `longest_side` pixels: where any pixel of the cell of `alpha` [height, width] is above
-    a half.
-    """
-    factor = int(np.ceil(max(alpha.shape) / longest_side))
-    rows, columns = (-(-side // factor) for side in alpha.shape)
-    if factor == 1:
-        return alpha > 0.5
-    # Zero padding to whole cells would move the right and bottom edges, so the last cells are resampled instead.
-    row_of = np.arange(alpha.shape[0]) * rows // alpha.shape[0]
-    column_of = np.arange(alpha.shape[1]) * columns // alpha.shape[1]
+def mask_preview(mask: np.ndarray, longest_side: int = 200) -> np.ndarray:
+    """bool, at most `longest_side` pixels: where any pixel of the cell of `mask` [height, width] is True."""
+    factor = int(np.ceil(max(mask.shape) / longest_side))
+    rows, columns = (-(-side // factor) for side in mask.shape)
+    # Cells of equal size over the whole image, so that the preview has the same field of view.
+    row_of = np.arange(mask.shape[0]) * rows // mask.shape[0]
+    column_of = np.arange(mask.shape[1]) * columns // mask.shape[1]
     out = np.zeros((rows, columns), bool)
-    marked_rows, marked_columns = np.nonzero(alpha > 0.5)
+    marked_rows, marked_columns = np.nonzero(mask)
     out[row_of[marked_rows], column_of[marked_columns]] = True
     return out

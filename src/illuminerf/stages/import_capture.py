@@ -4,6 +4,8 @@ The images are decoded, cut out by their masks, undistorted, brought to one size
 moved into the unit ball. All of it happens before `out` is touched: bad input leaves nothing behind.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from illuminerf.data.capture import Background, write_capture
-from illuminerf.data.developing import PlainBackground, develop, plan_sizes, planned_cameras, straight_srgb_uint8
+from illuminerf.data.developing import PlainBackground, develop, plan_sizes, planned_cameras
 from illuminerf.data.placement import Ball, focus_ball, hull_ball, mask_preview
 from illuminerf.data.reading import CaptureFormat, read_source
 from illuminerf.data.source import SourceCapture
@@ -19,6 +21,9 @@ from illuminerf.scene.cameras import Cameras
 from illuminerf.workflow.artefact import fingerprint, open_artefact
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say, track
+
+MAX_THREADS = 8
+"""Each thread holds one image in float, some 16 bytes per pixel several times over."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ def run(source: Path, config: Config, out: Path) -> Path:
     plan = plan_sizes(found, config.size)
     cameras = planned_cameras(found, plan)
     images = _developed(found, plan.per_frame, plan.common, config)
-    previews = [mask_preview(image[..., 3] / 255) for image in images]
+    previews = [mask_preview(image[..., 3] > 127) for image in images]
     background: Background = "opaque" if _is_opaque(images, plan.per_frame) else "masked"
     if background == "opaque":
         say(
@@ -100,10 +105,10 @@ def _developed(
 ) -> list[np.ndarray]:
     """uint8 [height, width, 4] per view: straight sRGB."""
     background = None if config.background == "none" else config.background
-    return [
-        straight_srgb_uint8(develop(frame, size, common, background))
-        for frame, size in track(list(zip(found.frames, sizes, strict=True)), "read images")
-    ]
+    # Decoding leaves the interpreter's lock, so threads are enough; the order stays that of the frames.
+    with ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1)) as pool:
+        images = pool.map(lambda frame, size: develop(frame, size, common, background), found.frames, sizes)
+        return list(track(images, "read images", total=len(found.frames)))
 
 
 def _is_opaque(images: list[np.ndarray], sizes: tuple[tuple[int, int], ...]) -> bool:
