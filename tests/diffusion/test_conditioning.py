@@ -82,7 +82,9 @@ def test_flax_default_initialisation_has_variance_one_over_fan_in() -> None:
     assert isinstance(layer, nn.Conv2d)
     assert float(layer.weight.detach().var()) * 9 * 64 == pytest.approx(1.0, rel=0.02)
     assert float(layer.weight.detach().abs().max()) <= 2 / (9 * 64) ** 0.5 / 0.879 + 1e-6
-    assert abs(float(nn.Conv2d(64, 256, 3).weight.detach().var()) * 9 * 64 - 1) > 0.5  # PyTorch's own default is another
+    assert (
+        abs(float(nn.Conv2d(64, 256, 3).weight.detach().var()) * 9 * 64 - 1) > 0.5
+    )  # PyTorch's own default is another
 
 
 def test_products_are_texture_times_cues_elementwise() -> None:

@@ -24,7 +24,7 @@ def lambertian_batch(brightness: float = 0.4) -> tuple[torch.Tensor, Batch]:
 
 
 def test_anchor_loss_is_zero_for_the_truth_and_by_hand_otherwise() -> None:
-    products, batch = lambertian_batch()
+    products, batch = lambertian_batch(brightness=0.15)
     assert float(anchor_loss(products, batch)) < 1e-8
     grey = batch._replace(target=(batch.target + 0.1) * batch.alpha)
     assert float(anchor_loss(products, grey)) == pytest.approx(0.01, rel=1e-3)
@@ -62,8 +62,8 @@ def test_a_few_steps_lower_the_loss(tmp_path: Path, with_diffusion: bool) -> Non
     losses = []
     for step in range(40):
         generator = torch.Generator().manual_seed(step % 4)
-        batch = make_batch(items, 8, AugmentationConfig(composited_share=0), generator)
-        loss, parts = training_loss(model, batch, generator, weights, scale_momentum=0.1 if step < 4 else 0)
+        batch = make_batch(items, 8, AugmentationConfig(composited_share=0.0), generator)
+        loss, parts = training_loss(model, batch, generator, weights, scale_momentum=0.1 if step < 4 else 0.0)
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()

@@ -63,7 +63,9 @@ def test_same_generator_same_batch(folder: Path) -> None:
 
 def test_input_and_target_come_from_different_lights(folder: Path) -> None:
     items = load_items(folder, 32)
-    batch = make_batch(items, 16, AugmentationConfig(mixture_share=0, composited_share=0, exposure=0), torch.Generator())
+    batch = make_batch(
+        items, 16, AugmentationConfig(mixture_share=0.0, composited_share=0.0, exposure=0.0), torch.Generator()
+    )
     difference = (batch.masked_image[:, :3] - batch.target).abs().amax((1, 2, 3))
     assert (difference > 0.01).all()
 

@@ -46,7 +46,9 @@ def write_items(folder: Path, count: int = 3, size: int = 32) -> Path:
     axis = torch.linspace(-1, 1, size)
     alpha = (axis[:, None] ** 2 + axis**2 < 0.7).float()
     for index in range(count):
-        cues = (0.2 + torch.rand(4, 12, 1, 1, generator=generator)) * (1.2 + axis) * alpha
+        across, down = torch.rand(2, 4, 12, 1, 1, generator=generator) * 1.2 - 0.6
+        brightness = 0.2 + torch.rand(4, 12, 1, 1, generator=generator)
+        cues = brightness * (1.3 + across * axis + down * axis[:, None]) * alpha
         albedo = 0.1 + 0.8 * torch.rand(3, 1, 1, generator=generator).expand(3, size, size)
         tensors = {
             "targets": (cues[:, :3] * albedo + 0.04 * cues[:, 9:]).half(),

@@ -73,7 +73,8 @@ def training_loss(
     parts: dict[str, float] = {}
     if model.config.latent_is_residual:
         anchor = anchor_loss(condition.products, batch)
-        loss, parts["anchor"] = loss + weights.anchor * anchor, float(anchor.detach())
+        parts["anchor"] = float(anchor.detach())
+        loss = loss + weights.anchor * anchor if anchor.requires_grad else loss
     if weights.diffusion > 0:
         diffusion = _diffusion_loss(model, batch, condition, generator, weights.outside, scale_momentum)
         loss, parts["diffusion"] = loss + weights.diffusion * diffusion, float(diffusion.detach())

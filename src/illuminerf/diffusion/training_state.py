@@ -50,7 +50,16 @@ def restore_training(path: Path, model: nn.Module, average: WeightAverage, optim
     model.load_state_dict(_under("model.", tensors))
     average.tensors = _under("average.", tensors)
     restore_optimizer(optimizer, tensors)
+    _match_layouts(optimizer)
     return int(metadata["step"])
+
+
+def _match_layouts(optimizer: torch.optim.Optimizer) -> None:
+    """Give moments their parameter's memory layout: files hold plain order, fused kernels walk both as flat memory."""
+    for parameter, state in optimizer.state.items():
+        for name, value in state.items():
+            if value.shape == parameter.shape:
+                state[name] = torch.empty_like(parameter).copy_(value)
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

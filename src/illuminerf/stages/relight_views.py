@@ -75,9 +75,7 @@ def run(capture: Path, cues: Path, model: Path | str, config: Config, out: Path)
         }
         write_json(out / "seeds.json", {f"{view:03d}": row for view, row in seeds.items()})
         todo = [
-            view
-            for view in seeds
-            if not all(sample_path(out, view, k).exists() for k in range(config.num_samples))
+            view for view in seeds if not all(sample_path(out, view, k).exists() for k in range(config.num_samples))
         ]
         device = resolve_device(config.device)
         network = load_model(folder, device)

@@ -9,7 +9,7 @@ import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from accelerate import Accelerator, DistributedDataParallelKwargs
@@ -50,8 +50,8 @@ class Phase:
     """Optimisation steps."""
     size: int
     """Pixels per side."""
-    with_diffusion: bool = True
-    """Whether the diffusion is trained, or only the composited products."""
+    trains: Literal["products", "diffusion", "all"] = "all"
+    """Only ConvNet 2, by the composited products; everything but ConvNet 2; or all."""
 
     def __post_init__(self) -> None:
         if self.num_steps < 1 or self.size < 8:
@@ -64,7 +64,7 @@ class Config:
 
     model: RelightingModelConfig = field(default=RelightingModelConfig())
     """Sizes of the networks."""
-    phases: tuple[Phase, ...] = (Phase(1500, 64, False), Phase(2000, 64), Phase(1000, 128))
+    phases: tuple[Phase, ...] = (Phase(1500, 64, "products"), Phase(2000, 64), Phase(1000, 128))
     """In order. Deviation: the paper trains 150,000 steps at one resolution."""
     batch_size: int = 32
     """Examples per step and process (paper: 512 in all)."""
@@ -111,6 +111,15 @@ class Config:
                 return phase
             step -= phase.num_steps
         return self.phases[-1]
+
+    def scale_momentum_at(self, step: int) -> float:
+        """How fast the latent scales follow: a running mean at first, then slowly, and not in the last third."""
+        start = 0
+        for phase in self.phases:
+            if phase.trains != "products":
+                break
+            start += phase.num_steps
+        return max(0.02, 1 / (1 + step - start)) if step < self.num_steps * 2 / 3 else 0.0
 
 
 def run(pairs: Path, held_out: Path, config: Config, out: Path) -> Path:
@@ -187,15 +196,15 @@ class _Training:
         )
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        # The latent scales settle while the residual shrinks, and stand still for the last two thirds.
-        momentum = 0.02 if step < config.num_steps * 2 / 3 and phase.with_diffusion else 0.0
+        momentum = 0.0 if phase.trains == "products" else config.scale_momentum_at(step)
+        self.model.conditioning.texture.requires_grad_(phase.trains != "diffusion")
         totals: dict[str, float] = {}
         items = self._items_at(phase.size)
         for part in range(config.accumulation):
             generator = torch_generator(config.seed, "batch", step, part, self.accelerator.process_index)
             batch = make_batch(items, config.batch_size, config.augmentation, generator)
             batch = type(batch)(*(tensor.to(self.accelerator.device) for tensor in batch))
-            loss, parts = self.objective(batch, generator, phase.with_diffusion, momentum)
+            loss, parts = self.objective(batch, generator, phase.trains != "products", momentum)
             self.accelerator.backward(loss / config.accumulation)
             totals = {name: totals.get(name, 0.0) + value / config.accumulation for name, value in parts.items()}
         self.accelerator.clip_grad_norm_(self.model.parameters(), 1.0)

@@ -1,0 +1,106 @@
+"""Relit samples: resumable, seeded, at the capture's size, black off the object."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from illuminerf.data.capture import write_capture
+from illuminerf.diffusion.relighting_model import save_model
+from illuminerf.scene.cameras import Cameras, look_at
+from illuminerf.scene.images import read_png, write_exr
+from illuminerf.stages import relight_views
+from illuminerf.stages.relight_views import Config, sample_path
+from illuminerf.workflow.errors import UserError
+from tests.diffusion.tiny import tiny_model, with_noise_in_every_weight
+
+SIZE = 40  # not a multiple of the model's 32
+CONFIG = Config(num_samples=2, num_steps=2, batch_size=2, device="cpu")
+CUES = [f"{lobe}.{c}" for lobe in ("diffuse", "ggx_005", "ggx_013", "ggx_034") for c in "RGB"]
+
+
+@pytest.fixture
+def inputs(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """A capture of three discs, constant cues, and a model that is not trained."""
+    generator = np.random.default_rng(0)
+    axis = np.linspace(-1, 1, SIZE)
+    alpha = (axis[:, None] ** 2 + (axis - 0.2) ** 2 < 0.4).astype(np.float32)
+    images = [np.dstack([0.5 * generator.random((SIZE, SIZE, 3)), alpha]).astype(np.float32) for _ in range(3)]
+    poses = np.stack([look_at(np.array([3.0, k, 1.0]), np.zeros(3)) for k in range(3)])
+    intrinsics = np.tile([60.0, 60.0, SIZE / 2, SIZE / 2], (3, 1))
+    cameras = Cameras(poses, intrinsics, SIZE, SIZE)
+    capture, cues, model = tmp_path / "capture", tmp_path / "cues", tmp_path / "model"
+    write_capture(capture, images, cameras, ["a", "b", "c"], 1.0, np.zeros(3), "masked")
+    for view in range(3):
+        write_exr(cues / "cues" / f"{view:03d}.exr", {name: 0.5 * alpha for name in CUES} | {"A": alpha})
+    save_model(with_noise_in_every_weight(tiny_model()), model)
+    return capture, cues, model
+
+
+def samples(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((folder / "samples").glob("*.png"))}
+
+
+def test_samples_are_complete_seeded_and_masked(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    out = relight_views.run(*inputs, CONFIG, tmp_path / "out")
+    assert sorted(samples(out)) == [f"{view:03d}_{k:02d}.png" for view in range(3) for k in range(2)]
+    first, second = (read_png(sample_path(out, 0, k)) for k in range(2))
+    assert first.shape == (SIZE, SIZE, 3)
+    alpha = read_png(inputs[0] / "images" / "000.png")[..., 3]
+    assert (first[alpha == 0] == 0).all() and first[alpha == 1].max() > 0
+    assert np.abs(first - second).max() > 0.02
+    seeds = json.loads((out / "seeds.json").read_text())
+    assert len({seed for row in seeds.values() for seed in row}) == 6
+    again = relight_views.run(*inputs, CONFIG, tmp_path / "again")
+    assert samples(again) == samples(out)
+
+
+def test_existing_samples_are_kept_and_missing_ones_made(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    out = relight_views.run(*inputs, CONFIG, tmp_path / "out")
+    whole = samples(out)
+    (out / "DONE").unlink()
+    sample_path(out, 2, 1).unlink()
+    kept = sample_path(out, 0, 0).stat().st_mtime_ns
+    relight_views.run(*inputs, CONFIG, out)
+    assert sample_path(out, 0, 0).stat().st_mtime_ns == kept
+    # A batch of another make-up may round differently: one level of 256.
+    remade = read_png(sample_path(out, 2, 1))
+    (tmp_path / "old.png").write_bytes(whole["002_01.png"])
+    assert np.abs(remade - read_png(tmp_path / "old.png")).max() <= 1.01 / 255
+
+
+def test_detail_of_the_photograph_survives(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    """The noise in the photographs is finer than the model's pixels; a plain enlargement would lose it."""
+    torch.manual_seed(0)
+    save_model(tiny_model(), tmp_path / "copying")  # starts as 0.2 + 0.6 * image
+    model = tmp_path / "copying"
+    out = relight_views.run(inputs[0], inputs[1], model, CONFIG, tmp_path / "out")
+    photograph = read_png(inputs[0] / "images" / "000.png")
+    inside = photograph[..., 3] == 1
+    mean = np.mean([read_png(sample_path(out, 0, k)) for k in range(2)], 0)
+    detail = photograph[..., :3] - _blurred(photograph[..., :3])
+    ours = mean - _blurred(mean)
+    same = np.corrcoef(detail[inside].ravel(), ours[inside].ravel())[0, 1]
+    assert same > 0.5
+    enlarged = _blurred(photograph[..., :3])
+    assert np.corrcoef(detail[inside].ravel(), (enlarged - _blurred(enlarged))[inside].ravel())[0, 1] < same
+
+
+def _blurred(image: np.ndarray) -> np.ndarray:
+    return sum(np.roll(image, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)) / 9
+
+
+def test_what_does_not_fit_is_a_user_error(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    capture, cues, model = inputs
+    with pytest.raises(UserError, match="holds no relighting model"):
+        relight_views.run(capture, cues, tmp_path / "none", CONFIG, tmp_path / "out")
+    write_exr(cues / "cues" / "001.exr", {name: np.zeros((8, 8), np.float32) for name in [*CUES, "A"]})
+    with pytest.raises(UserError, match="does not fit the capture"):
+        relight_views.run(capture, cues, model, CONFIG, tmp_path / "out")
+    (cues / "cues" / "001.exr").unlink()
+    with pytest.raises(UserError, match="missing"):
+        relight_views.run(capture, cues, model, CONFIG, tmp_path / "out2")
+    with pytest.raises(UserError, match="at least 1"):
+        Config(num_samples=0)
