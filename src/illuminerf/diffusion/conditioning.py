@@ -172,6 +172,7 @@ class TextureNetwork(nn.Module):
             self.out.weight.mul_(0.1)
             start = torch.full((2, NUM_CUE_CHANNELS), -0.3)
             start[1], start[0, :3], start[1, :3] = 0.0, 0.2, 0.6
+            assert self.out.bias is not None
             self.out.bias.copy_(start.reshape(-1).repeat_interleave(self.config.patch**2))
 
     def maps(self, masked_image: Float[Tensor, "batch 4 height width"]) -> Float[Tensor, "batch maps height width"]:

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from illuminerf.diffusion.conditioning import Condition
 from illuminerf.diffusion.cue_coding import composited_srgb
 from illuminerf.diffusion.relighting_model import NUM_TRAIN_TIMESTEPS, RelightingModel, noise_schedule
 
@@ -84,7 +85,7 @@ def training_loss(
 def _diffusion_loss(
     model: RelightingModel,
     batch: Batch,
-    condition: tuple,
+    condition: Condition,
     generator: torch.Generator,
     outside: float,
     scale_momentum: float,

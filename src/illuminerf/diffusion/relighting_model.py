@@ -7,6 +7,7 @@ outside of it so that it runs once per image and not once per step. Folder layou
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from diffusers import ControlNetModel, DDPMScheduler, UNet2DConditionModel
@@ -132,8 +133,8 @@ class RelightingModel(nn.Module):
         )[0]
 
 
-def build_base(config: RelightingModelConfig) -> UNet2DConditionModel:
-    """The base UNet with fresh weights."""
+def build_base(config: RelightingModelConfig) -> Any:
+    """The base, a `UNet2DConditionModel` (diffusers leaves it partly untyped), with fresh weights."""
     unet = config.unet
     down = tuple("CrossAttnDownBlock2D" if attends else "DownBlock2D" for attends in unet.attention_blocks)
     up = tuple(
@@ -155,8 +156,8 @@ def build_base(config: RelightingModelConfig) -> UNet2DConditionModel:
     )
 
 
-def noise_schedule() -> DDPMScheduler:
-    """Cosine schedule, v-prediction: its last step is noise alone up to 5e-5, as few-step sampling needs."""
+def noise_schedule() -> Any:
+    """A `DDPMScheduler`. Cosine schedule, v-prediction: its last step is noise alone up to 5e-5, as few-step sampling needs."""
     return DDPMScheduler(
         num_train_timesteps=NUM_TRAIN_TIMESTEPS,
         beta_schedule="squaredcos_cap_v2",
