@@ -60,9 +60,18 @@ def test_smoothness_and_mask() -> None:
     same = torch.ones(2, 3)
     assert float(losses.normal_smoothness_loss(torch.ones(2), same, same, 1)) == 0
     assert float(losses.normal_smoothness_loss(torch.ones(2), same, same + 1, 2)) == pytest.approx(3.0)
-    right = losses.mask_loss(torch.tensor([1.0, 0.0]), torch.tensor([1.0, 0.0]))
-    wrong = losses.mask_loss(torch.tensor([0.0, 1.0]), torch.tensor([1.0, 0.0]))
-    assert float(right) < 0.01 < float(wrong)
+    alpha = torch.tensor([1.0, 0.0])
+    right = losses.mask_loss(torch.tensor([50.0, 0.0]), alpha)
+    wrong = losses.mask_loss(torch.tensor([0.0, 50.0]), alpha)
+    assert float(right) < 1e-6 < 1 < float(wrong)
+
+
+def test_an_opaque_ray_before_the_background_still_gets_a_gradient() -> None:
+    depth = torch.tensor([60.0], requires_grad=True)
+    losses.mask_loss(depth, torch.tensor([0.0])).backward()
+    assert float(depth.grad) > 0.01
+    opacity = (1 - torch.exp(-depth.detach())).requires_grad_()
+    assert float(opacity) == 1.0  # which is why opacity itself cannot carry it
 
 
 def test_psnr() -> None:

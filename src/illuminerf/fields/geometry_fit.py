@@ -14,6 +14,8 @@ from illuminerf.fields.radiance_field import RadianceField
 from illuminerf.fields.ray_pool import RayPool
 from illuminerf.workflow.device import torch_generator
 
+_HULL_MARGIN_CELLS = 1.9
+
 
 @dataclass(frozen=True)
 class GeometryLossConfig:
@@ -85,8 +87,7 @@ def geometry_loss(
     )
     total = total + config.normal_smoothness * losses.normal_smoothness_loss(points.weights, predicted, perturbed, rays)
     if target_alpha is not None:
-        opacity = samples.weights.sum(-1)
-        total = total + config.mask * losses.mask_loss(opacity, target_alpha[index])
+        total = total + config.mask * losses.mask_loss(samples.depth, target_alpha[index])
     numbers = {"psnr": losses.psnr(squared), "beta": float(field.surface.beta.detach())}
     return total, numbers
 
@@ -101,8 +102,9 @@ def start_from_cells(
     """
     if bool(cells.cells.all()):
         return
-    target = signed_distance_of_cells(cells.cells).to(cells.cells.device)
     side = cells.cells.shape[0]
+    # the hull takes in every cell that a mask touches, and a margin of one cell
+    target = signed_distance_of_cells(cells.cells).to(cells.cells.device) + _HULL_MARGIN_CELLS * 2 / side
     close = (target.abs() < 0.15).view(-1).nonzero()[:, 0]
     surface = field.surface
     levels = coarse_to_fine_weights(surface.config.grid.num_levels, 0.0, first_levels, close.device)

@@ -7,7 +7,6 @@ divided by the number of rays: a mean over rays of a sum over each ray's samples
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 
 def colour_loss(srgb: Float[Tensor, "rays 3"], target_srgb: Float[Tensor, "rays 3"]) -> Float[Tensor, ""]:
@@ -25,9 +24,20 @@ def eikonal_loss(gradient: Float[Tensor, "points 3"]) -> Float[Tensor, ""]:
     return ((gradient.norm(dim=-1) - 1) ** 2).mean()
 
 
-def mask_loss(opacity: Float[Tensor, " rays"], alpha: Float[Tensor, " rays"]) -> Float[Tensor, ""]:
-    """Binary cross entropy between opacity and coverage, mean over rays."""
-    return functional.binary_cross_entropy(opacity.clamp(1e-3, 1 - 1e-3), alpha)
+def mask_loss(depth: Float[Tensor, " rays"], alpha: Float[Tensor, " rays"]) -> Float[Tensor, ""]:
+    """Opacity 1 - exp(-depth) against coverage, mean over rays.
+
+    Binary cross entropy with its background term -log(1 - opacity) = depth replaced by log(1 + depth). Written in the
+    optical depth, because an opaque ray's opacity has no gradient left and matter before the background would stay;
+    with the logarithm, so that a few very dense rays do not drown all others.
+
+    Args:
+        depth: optical depth of the whole ray.
+        alpha: coverage of its pixel.
+    """
+    outside = torch.log1p(depth)
+    inside = -torch.log(-torch.expm1(-depth.clamp_min(1e-3)))
+    return ((1 - alpha) * outside + alpha * inside).mean()
 
 
 def orientation_loss(

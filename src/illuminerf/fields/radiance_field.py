@@ -81,6 +81,7 @@ class RaySamples:
     edges: Float[Tensor, "rays edges"]
     positions: Float[Tensor, "rays samples 3"]
     weights: Float[Tensor, "rays samples"]
+    depth: Float[Tensor, " rays"]
     gradients: Float[Tensor, "rays samples 3"]
     proposal_edges: Float[Tensor, "rays proposal_edges"]
     proposal_weights: Float[Tensor, "rays proposal_samples"]
@@ -122,10 +123,11 @@ class RadianceField(nn.Module):
         edges = resample_edges(coarse, proposal_weights, self.config.num_samples, generator)
         positions = _middles(origins, directions, edges)
         point = self.surface(positions.view(-1, 3), level_weights)
-        weights = rendering_weights(self.surface.depths_along(point, directions, edges))
+        depths = self.surface.depths_along(point, directions, edges)
         gradients = point.gradient.view_as(positions)
         positions = positions + _to_crossing(point, gradients, directions, edges)[..., None] * directions[:, None]
-        return RaySamples(edges, positions, weights, gradients, coarse, proposal_weights)
+        weights = rendering_weights(depths)
+        return RaySamples(edges, positions, weights, depths.sum(-1), gradients, coarse, proposal_weights)
 
     def worth_shading(self, samples: RaySamples) -> ShadingPoints:
         """Samples above the configured weight.
