@@ -157,7 +157,10 @@ def build_base(config: RelightingModelConfig) -> Any:
 
 
 def noise_schedule() -> Any:
-    """A `DDPMScheduler`. Cosine schedule, v-prediction: its last step is noise alone up to 5e-5, as few-step sampling needs."""
+    """A `DDPMScheduler` with cosine schedule and v-prediction.
+
+    Its last timestep is noise alone up to 5e-5 of signal, as few-step sampling needs.
+    """
     return DDPMScheduler(
         num_train_timesteps=NUM_TRAIN_TIMESTEPS,
         beta_schedule="squaredcos_cap_v2",
