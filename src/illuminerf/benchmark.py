@@ -100,6 +100,6 @@ def _light(folder: Path, name: str) -> Path:
 def _report(scores: dict[str, Any], covers: str, json: Path | None) -> None:
     if json is not None:
         write_json(json, scores)
-    console.print(cell_table(scores["psnr"], scores["ssim"], scores.get("lpips")))
+    console.print(cell_table(scores["psnr"], scores["ssim"], scores.get("lpips"), scores.get("input_light")))
     mean = scores["mean"]
     console.print(published_table(mean["psnr"], mean["ssim"], mean.get("lpips"), covers))

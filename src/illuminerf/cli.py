@@ -26,12 +26,11 @@ from illuminerf.stages import (
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import console, say
 
-Positional = tyro.conf.Positional
-Folder = Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
+PositionalPath = Annotated[Path, tyro.conf.Positional]
 
 
 def relight_command(
-    capture: Positional[Path],
+    capture: PositionalPath,
     out: Path,
     light: tyro.conf.UseAppendAction[tuple[Path, ...]],
     preset: str = "embedded",
@@ -94,8 +93,10 @@ def _stage(run: Callable[..., Path], config: type, description: str, inputs: dic
 
     command.__doc__ = description
     optional = {name for name, kind in inputs.items() if kind == Path | None}
-    kinds = {name: kind if name in optional else Positional[kind] for name, kind in inputs.items()}
-    kinds |= {"out": Path, "config": tyro.conf.OmitArgPrefixes[config]}  # type: ignore[valid-type]
+    kinds: dict[str, Any] = {
+        name: kind if name in optional else Annotated[kind, tyro.conf.Positional] for name, kind in inputs.items()
+    }
+    kinds |= {"out": Path, "config": Annotated[config, tyro.conf.OmitArgPrefixes]}
     defaults: dict[str, Any] = {"config": config()} | dict.fromkeys(optional)
     command.__annotations__ = kinds
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]

@@ -16,9 +16,11 @@ def mean_of(cells: PerLight) -> float:
     return float(np.mean([np.mean(list(lights.values())) for lights in cells.values()]))
 
 
-def cell_table(psnr: PerLight, ssim: PerLight, lpips: PerLight | None = None) -> Table:
+def cell_table(
+    psnr: PerLight, ssim: PerLight, lpips: PerLight | None = None, input_light: PerLight | None = None
+) -> Table:
     """One row per scene and light, beside the PSNR of the gallery's renderings where they are known, and
-    the mean.
+    the mean. `input_light` is what doing nothing scores on the same frames; by default that of the gallery.
     """
     table = Table(title="Relighting, per scene and light (gallery: published renderings under the same rule)")
     for heading in ("scene", "light"):
@@ -30,19 +32,26 @@ def cell_table(psnr: PerLight, ssim: PerLight, lpips: PerLight | None = None) ->
         for light, value in lights.items():
             gallery = gallery_scores(scene, light)
             known += [gallery] if gallery else []
-            beside = [gallery.paper, gallery.tensoir, gallery.input_light] if gallery else [None] * 3
+            beside: list[float | None] = [None] * 3
+            if gallery:
+                beside = [gallery.paper, gallery.tensoir, gallery.input_light]
+            if input_light is not None:
+                beside[2] = input_light[scene][light]
             distance = lpips[scene][light] if lpips else None
             table.add_row(scene, light, *_numbers([value], 2), *_numbers([ssim[scene][light], distance], 3),
                           *_numbers(beside, 2))  # fmt: skip
     complete = len(known) == sum(map(len, psnr.values()))
     columns = [[row.paper for row in known], [row.tensoir for row in known], [row.input_light for row in known]]
+    means = [float(np.mean(column)) if complete else None for column in columns]
+    if input_light is not None:
+        means[2] = mean_of(input_light)
     table.add_section()
     table.add_row(
         "mean",
         "",
         *_numbers([mean_of(psnr)], 2),
         *_numbers([mean_of(ssim), mean_of(lpips) if lpips else None], 3),
-        *_numbers([float(np.mean(column)) if complete else None for column in columns], 2),
+        *_numbers(means, 2),
     )
     return table
 

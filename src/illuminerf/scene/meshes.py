@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from illuminerf.scene.images import linear_from_srgb, to_uint8
 from illuminerf.workflow.atomic import write_bytes
 from illuminerf.workflow.errors import UserError
 
@@ -39,17 +40,16 @@ class TriangleMesh:
 
     def save_glb(self, path: Path) -> None:
         """Write binary glTF 2.0, turned to its y-up axes, atomically; normals and colours are kept."""
+        colors = None
+        if self.vertex_colors is not None:
+            colors = to_uint8(linear_from_srgb(self.vertex_colors))  # glTF vertex colours are linear
         mesh = trimesh.Trimesh(
             self.vertices @ _GLTF_FROM_WORLD.T,
             self.faces,
             vertex_normals=self.vertex_normals @ _GLTF_FROM_WORLD.T,
+            vertex_colors=colors,
             process=False,
         )
-        if self.vertex_colors is not None:
-            # glTF vertex colours are linear
-            from illuminerf.scene.images import linear_from_srgb, to_uint8
-
-            mesh.visual.vertex_colors = to_uint8(linear_from_srgb(self.vertex_colors))
         write_bytes(path, trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=True))
 
     @staticmethod
@@ -63,13 +63,13 @@ class TriangleMesh:
             raise UserError(f"{path} is missing", wanted="a .glb mesh")
         try:
             scene = trimesh.load_scene(str(path), file_type="glb", process=False)
-            parts = [_placed(scene, node) for node in scene.graph.nodes_geometry]
+            placed = [_placed(scene, node) for node in scene.graph.nodes_geometry]
         except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
             raise UserError(f"{path} is not a readable GLB mesh", got=str(error), fix="export it again") from error
-        parts = [part for part in parts if part is not None]
+        parts = [part for part in placed if part is not None]
         if not parts:
             raise UserError(f"{path} holds no triangles")
-        firsts = np.cumsum([0] + [len(vertices) for vertices, _, _ in parts[:-1]])
+        firsts: np.ndarray = np.cumsum(np.array([0, *(len(vertices) for vertices, _, _ in parts[:-1])]))
         return TriangleMesh(
             np.concatenate([vertices for vertices, _, _ in parts]),
             np.concatenate([faces + first for (_, faces, _), first in zip(parts, firsts, strict=True)]).astype(
@@ -89,9 +89,8 @@ def _placed(scene: trimesh.Scene, node: str) -> tuple[np.ndarray, np.ndarray, np
     vertices = mesh.vertices @ transform[:3, :3].T + transform[:3, 3]
     normals = mesh.vertex_normals @ normal_transform.T
     normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    turned = (np.ascontiguousarray(array @ _GLTF_FROM_WORLD, np.float32) for array in (vertices, normals))
-    vertices, normals = turned
-    return vertices, np.asarray(mesh.faces, np.int64), normals
+    turned = [np.ascontiguousarray(array @ _GLTF_FROM_WORLD, np.float32) for array in (vertices, normals)]
+    return turned[0], np.asarray(mesh.faces, np.int64), turned[1]
 
 
 def sphere_mesh(subdivisions: int = 4, radius: float = 1.0) -> TriangleMesh:

@@ -19,7 +19,7 @@ def write_mp4(path: Path, frames: Iterable[np.ndarray], frames_per_second: int =
         atomic_path(path) as temporary,
         imageio.get_writer(
             temporary,
-            format="FFMPEG",  # type: ignore[arg-type]
+            format="FFMPEG",
             mode="I",
             fps=frames_per_second,
             codec="libx264",
@@ -31,4 +31,6 @@ def write_mp4(path: Path, frames: Iterable[np.ndarray], frames_per_second: int =
     ):
         for frame in frames:
             even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
-            writer.append_data(np.ascontiguousarray(to_uint8(even)))
+            writer.append_data(  # type: ignore[attr-defined]
+                np.ascontiguousarray(to_uint8(even))
+            )

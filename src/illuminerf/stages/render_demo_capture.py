@@ -16,6 +16,7 @@ from illuminerf.cues.shading import render_shaded
 from illuminerf.scene.cameras import Cameras, sphere_cameras, spiral_cameras
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import linear_from_srgb, write_png
+from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.scene.procedural import duck_still_life, evening_light, studio_light
 from illuminerf.scene.views import Views
 from illuminerf.workflow.artefact import open_artefact
@@ -96,7 +97,7 @@ def _write(
     out: Path,
     folder: str,
     cameras: Cameras,
-    parts: list,  # type: ignore[type-arg]
+    parts: list[tuple[TriangleMesh, Material]],
     light: EnvironmentMap,
     config: Config,
 ) -> None:
