@@ -37,7 +37,8 @@ def draw_light(
 ) -> tuple[EnvironmentMap, LightDraw]:
     """Shift, flip and scale a light at random.
 
-    Deviation: the paper states no exposure rule. The scale is the least change that brings the mean radiance into `MEAN_RADIANCE_RANGE`.
+    Deviation: the paper states no exposure rule. The scale is the least change that brings the mean radiance into
+    `MEAN_RADIANCE_RANGE`.
     """
     width = light.linear_rgb.shape[1]
     rotation = float(generator.integers(width)) * 2 * np.pi / width

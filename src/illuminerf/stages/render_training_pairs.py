@@ -51,13 +51,14 @@ class Config:
     size: int = 128
     """Height and width in pixels (paper: 512)."""
     samples_per_pixel: int = 16
-    """Paths per pixel of the targets (paper: 512)."""
+    """Paths per pixel of the targets. Deviation: 512 in the paper; the model averages what noise is left."""
     cue_sampling: CueSampling = field(default_factory=lambda: CueSampling(samples_per_pixel=16))
     """Paths and bounces of the cues."""
     min_distance: float = 2.6
     """Nearest camera, in radii of the object."""
     max_distance: float = 3.8
-    """Farthest camera; the field of view follows, so that the object always fills the picture."""
+    """Farthest camera; the field of view follows, so that the object always fills the picture.
+    Deviation: the paper's focal length is 512 pixels at 512 x 512, whatever the distance."""
     margin: float = 1.06
     """Half the picture over the object's farthest point from its centre."""
     min_elevation_radians: float = -0.4
