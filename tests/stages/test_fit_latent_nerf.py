@@ -23,7 +23,7 @@ from illuminerf.workflow.errors import UserError
 _GRID = HashGridConfig(5, 2, 12, 8, 48)
 _GEOMETRY = estimate_geometry.Config(
     radiance_field=FieldConfig(
-        SurfaceConfig(_GRID, 32, HashGridConfig(4, 2, 11, 8, 32), 16),
+        SurfaceConfig(_GRID, 32, HashGridConfig(4, 2, 11, 8, 32), 16, initial_beta=0.01),
         AppearanceConfig(_GRID, 8, 32, 1, 2, 4, 16),
         ProposalConfig(HashGridConfig(3, 2, 10, 8, 24), 8),
         num_proposal_samples=16,

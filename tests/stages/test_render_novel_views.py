@@ -29,7 +29,7 @@ def sphere_field(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained field is an opaque sphere of radius 0.5."""
     torch.manual_seed(0)
     config = FieldConfig(
-        SurfaceConfig(_GRID, 8, _GRID, 8, initial_beta=2e-3),
+        SurfaceConfig(_GRID, 8, _GRID, 8, initial_beta=3e-4),
         AppearanceConfig(_GRID, 8, 8, 1, 1, 4, 8),
         ProposalConfig(_GRID, 8),
         num_proposal_samples=32,
@@ -53,9 +53,9 @@ def test_turntable(sphere_field: Path, tmp_path: Path) -> None:
         image, linear = read_png(out / f"images/{view:03d}.png"), read_exr(out / f"linear/{view:03d}.exr")
         assert image.shape == (24, 32, 4)
         alpha = linear["A"]
-        # a sphere of radius 0.5 at distance 2.5 covers pi f^2 r^2 / (d^2 - r^2) pixels (on the axis)
+        # a sphere of radius 0.5 at distance 2.5 covers pi f^2 r^2 / (d^2 - r^2) pixels (on the axis), its shell more
         focal = wanted.intrinsics[0, 0]
-        assert alpha.sum() == pytest.approx(np.pi * focal**2 * 0.25 / (2.5**2 - 0.25), rel=0.05)
+        assert alpha.sum() == pytest.approx(np.pi * focal**2 * 0.25 / (2.5**2 - 0.25), rel=0.06)
         np.testing.assert_allclose(image[..., 3], alpha, atol=4e-3)
         premultiplied = linear_from_srgb(image[..., :3]) * image[..., 3:]
         stacked = np.stack([linear[name] for name in "RGB"], -1)

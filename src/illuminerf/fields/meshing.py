@@ -49,8 +49,8 @@ def extract_mesh(
             "the fitted surface is empty: its signed distance has no zero crossing",
             fix="check masks and cameras, or fit for more steps",
         )
-    # the volume is positive outside and marching_cubes orients faces by its gradient
-    vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(spacing,) * 3, gradient_direction="ascent")
+    # inside is below outside, and faces come out counter-clockwise seen from outside (held by a test)
+    vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
     vertices, faces = _large_components(vertices + low, faces, min_component_share)
     positions = torch.from_numpy(vertices.astype(np.float32)).to(device)
     normals = torch.cat([surface.predicted_normals(chunk) for chunk in positions.split(_CHUNK)])

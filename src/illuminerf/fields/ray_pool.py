@@ -48,6 +48,14 @@ class RayPool:
         outside = torch.randint(max(num_background, 1), (num_rays - num_chosen,), generator=generator, device=device)
         return torch.cat([inside, self.num_foreground + outside])
 
+    def foreground_subset(self, max_rays: int, generator: torch.Generator) -> "RayPool":
+        """The foreground rays, or a random `max_rays` of them (in order) where there are more."""
+        device = self.view.device
+        order = torch.randperm(self.num_foreground, generator=generator, device=device)
+        chosen = order[:max_rays].sort().values
+        parts = (self.view[chosen], self.pixel[chosen], self.near[chosen], self.far[chosen])
+        return RayPool(*parts, len(chosen), self.cameras)
+
     def rays(
         self, index: Int[Tensor, " batch"]
     ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"], Float[Tensor, " batch"], Float[Tensor, " batch"]]:

@@ -30,6 +30,8 @@ class Config:
     """Steps, rays, learning rates."""
     num_kept: int = 4
     """Heaviest samples of each ray that are shaded."""
+    max_rays: int = 400_000
+    """Pixels that are trained on, drawn at random over all views; each is cached once and seen in every sample."""
     use_latents: bool = True
     """One latent code per relit image; False is the paper's ablation, a standard NeRF."""
     latent_penalty: float = 1e-4
@@ -40,13 +42,13 @@ class Config:
     """auto, cpu or cuda."""
 
     def __post_init__(self) -> None:
-        if self.num_kept < 1 or self.latent_penalty < 0:
-            raise UserError("num_kept must be positive and latent_penalty not negative", got=str(self))
+        if min(self.num_kept, self.max_rays) < 1 or self.latent_penalty < 0:
+            raise UserError("num_kept and max_rays must be positive, the penalty not negative", got=str(self))
 
     @classmethod
     def paper(cls) -> "Config":
         """The paper's settings."""
-        return cls(optimiser=OptimiserConfig.paper(), num_kept=16, latent_penalty=0.0)
+        return cls(optimiser=OptimiserConfig.paper(), num_kept=16, max_rays=4_000_000)
 
 
 class _LatentNerf(nn.Module):
@@ -85,6 +87,7 @@ def run(geometry_path: Path, capture_path: Path, relit_path: Path, config: Confi
         views = load_capture(capture_path).views
         sample_views, num_samples = find_samples(relit_path, len(views))
         pool = gather_rays(views.cameras[sample_views], views.alpha[sample_views], stored.cells, device)
+        pool = pool.foreground_subset(config.max_rays, torch_generator(config.seed, "pixels", device=device))
         targets = _targets(relit_path, pool, sample_views, num_samples)
         cache = cache_shading(stored.field, pool, config.num_kept)
         generator = torch_generator(config.seed, "latents")
