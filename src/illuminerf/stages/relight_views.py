@@ -74,14 +74,13 @@ def run(capture: Path, cues: Path, model: Path | str, config: Config, out: Path)
             for view in range(len(views))
         }
         write_json(out / "seeds.json", {f"{view:03d}": row for view, row in seeds.items()})
-        todo = [
-            view for view in seeds if not all(sample_path(out, view, k).exists() for k in range(config.num_samples))
-        ]
+        # A batch is redone whole: convolutions round differently in batches of another size.
+        batches = [list(seeds)[start : start + config.batch_size] for start in range(0, len(seeds), config.batch_size)]
+        todo = [batch for batch in batches if not _is_relit(out, batch, config.num_samples)]
         device = resolve_device(config.device)
         network = load_model(folder, device)
-        with step_progress("relight views", len(views), len(views) - len(todo)) as progress:
-            for start in range(0, len(todo), config.batch_size):
-                batch = todo[start : start + config.batch_size]
+        with step_progress("relight views", len(views), len(views) - sum(map(len, todo))) as progress:
+            for batch in todo:
                 _relight(network, views, cues, batch, [seeds[view] for view in batch], config, out)
                 progress.advance(len(batch))
         artefact.finish({"num_views": len(views), "num_samples": config.num_samples})
@@ -91,6 +90,10 @@ def run(capture: Path, cues: Path, model: Path | str, config: Config, out: Path)
 def sample_path(folder: Path, view: int, sample: int) -> Path:
     """samples/<000>_<00>.png of the relit views in `folder`."""
     return folder / "samples" / f"{view:03d}_{sample:02d}.png"
+
+
+def _is_relit(out: Path, batch: list[int], num_samples: int) -> bool:
+    return all(sample_path(out, view, k).exists() for view in batch for k in range(num_samples))
 
 
 def _relight(
