@@ -71,7 +71,7 @@ def test_an_opaque_ray_before_the_background_still_gets_a_gradient() -> None:
     losses.mask_loss(depth, torch.tensor([0.0])).backward()
     assert float(depth.grad) > 0.01
     opacity = (1 - torch.exp(-depth.detach())).requires_grad_()
-    assert float(opacity) == 1.0  # which is why opacity itself cannot carry it
+    assert float(opacity.detach()) == 1.0  # which is why opacity itself cannot carry it
 
 
 def test_psnr() -> None:

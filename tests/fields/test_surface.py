@@ -62,13 +62,16 @@ def test_weights_peak_where_the_ray_meets_the_sphere() -> None:
     directions = torch.tensor([[0.0, 0, 1]], dtype=torch.float64)
     edges = torch.linspace(1, 3, 81, dtype=torch.float64)[None]
     middles = 0.5 * (edges[0, 1:] + edges[0, :-1])
-    positions = torch.tensor([[0.0, 0, -2]], dtype=torch.float64) + middles[:, None] * directions
-    weights = rendering_weights(surface.depths_along(surface(positions), directions, edges))[0]
+    ends = torch.tensor([[0.0, 0, -2]], dtype=torch.float64) + edges[0, :, None] * directions
+    weights = rendering_weights(surface.depths_along(surface(ends).signed_distance[None], edges))[0].detach()
     assert abs(float(weights.sum()) - 1) < 1e-3
     # the expected depth is the distance to the sphere, to a few beta and not to the width of an interval
     assert abs(float((weights * middles).sum()) - 1.5) < 0.02
-    beside = positions + torch.tensor([0.6, 0, 0], dtype=torch.float64)
-    assert float(surface.depths_along(surface(beside), directions, edges).sum()) < 1e-3
+    beside = surface(ends + torch.tensor([0.55, 0, 0], dtype=torch.float64)).signed_distance[None]
+    assert float(surface.depths_along(beside, edges).detach().sum()) < 1e-3
+    # three wide intervals past the sphere do not see it either
+    few = edges[:, ::27]
+    assert float(surface.depths_along(beside[:, ::27], few).detach().sum()) < 1e-3
 
 
 def test_surface_cells_keep_the_shell_and_the_inside() -> None:

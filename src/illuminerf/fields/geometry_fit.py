@@ -72,7 +72,7 @@ def geometry_loss(
     noise = torch.randn(points.positions.shape, generator=generator, device=device) * config.smoothness_sigma
     perturbed = field.surface.predicted_normals(points.positions + noise, normal_levels)
     anywhere = torch.rand(len(index), 3, generator=generator, device=device) * 1.6 - 0.8
-    gradients = torch.cat([samples.gradients.view(-1, 3), field.surface(anywhere, levels).gradient])
+    gradients = torch.cat([samples.end_gradients.view(-1, 3), field.surface(anywhere, levels).gradient])
 
     # Charbonnier as in camp_zipnerf: against the squared error's ever smaller gradient the smoothness terms win
     squared = losses.colour_loss(srgb.detach(), target_srgb[index])

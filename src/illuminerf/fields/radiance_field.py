@@ -11,7 +11,7 @@ from torch.nn import functional
 from illuminerf.fields.appearance import AppearanceConfig, AppearanceField, blend_radiance
 from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.proposal_sampling import ProposalConfig, ProposalField, resample_edges, uniform_edges
-from illuminerf.fields.surface import SurfaceConfig, SurfaceField, SurfacePoint
+from illuminerf.fields.surface import SurfaceConfig, SurfaceField
 from illuminerf.fields.volume_rendering import rendering_weights
 from illuminerf.workflow.errors import UserError
 
@@ -83,6 +83,7 @@ class RaySamples:
     weights: Float[Tensor, "rays samples"]
     depth: Float[Tensor, " rays"]
     gradients: Float[Tensor, "rays samples 3"]
+    end_gradients: Float[Tensor, "rays edges 3"]
     proposal_edges: Float[Tensor, "rays proposal_edges"]
     proposal_weights: Float[Tensor, "rays proposal_samples"]
 
@@ -116,18 +117,30 @@ class RadianceField(nn.Module):
         generator: torch.Generator | None = None,
         level_weights: Float[Tensor, " levels"] | None = None,
     ) -> RaySamples:
-        """Choose samples by the proposal, evaluate the surface at them and weigh them. A generator adds jitter."""
+        """Choose intervals by the proposal, evaluate the surface at their ends and weigh them.
+
+        Args:
+            generator: adds jitter; None is deterministic.
+        """
         coarse = uniform_edges(near, far, self.config.num_proposal_samples, generator)
         density = self.proposal(_middles(origins, directions, coarse).view(-1, 3)).view(len(near), -1)
         proposal_weights = rendering_weights(density * (coarse[:, 1:] - coarse[:, :-1]))
         edges = resample_edges(coarse, proposal_weights, self.config.num_samples, generator)
-        positions = _middles(origins, directions, edges)
-        point = self.surface(positions.view(-1, 3), level_weights)
-        depths = self.surface.depths_along(point, directions, edges)
-        gradients = point.gradient.view_as(positions)
-        positions = positions + _to_crossing(point, gradients, directions, edges)[..., None] * directions[:, None]
-        weights = rendering_weights(depths)
-        return RaySamples(edges, positions, weights, depths.sum(-1), gradients, coarse, proposal_weights)
+        ends = origins[:, None] + edges[..., None] * directions[:, None]
+        point = self.surface(ends.view(-1, 3), level_weights)
+        distance, end_gradients = point.signed_distance.view_as(edges), point.gradient.view_as(ends)
+        depths = self.surface.depths_along(distance, edges)
+        share = _crossing(distance)[..., None]
+        return RaySamples(
+            edges,
+            torch.lerp(ends[:, :-1], ends[:, 1:], share),
+            rendering_weights(depths),
+            depths.sum(-1),
+            torch.lerp(end_gradients[:, :-1], end_gradients[:, 1:], share),
+            end_gradients,
+            coarse,
+            proposal_weights,
+        )
 
     def worth_shading(self, samples: RaySamples) -> ShadingPoints:
         """Samples above the configured weight.
@@ -171,16 +184,15 @@ class RadianceField(nn.Module):
         return predicted, predicted if self.config.radiance_normals == "predicted" else points.density_normals
 
 
-def _to_crossing(point: SurfacePoint, gradients: Tensor, directions: Tensor, edges: Tensor) -> Tensor:
-    """How far to move each sample along its ray to where the ray enters the surface, if that is in its interval.
+def _crossing(distance: Tensor) -> Tensor:
+    """Where in its interval each sample lies, 0 to 1: where the ray enters the surface, else in the middle.
 
-    Deviation: such a sample stands for the surface and is shaded on it; in the middle of its interval it may lie
-    below, where no colour was ever learnt, which speckles images made with few samples.
+    Deviation: a sample whose interval holds the surface stands for it and is shaded on it. In the middle of its
+    interval it may lie below, where no colour was ever learnt, which speckles images made with few samples.
     """
-    slope = (gradients.detach() * directions[:, None]).sum(-1)
-    shift = point.signed_distance.detach().view_as(slope) / (-slope).clamp_min(1e-4)
-    within = (slope < 0) & (shift.abs() < 0.5 * (edges[:, 1:] - edges[:, :-1]))
-    return torch.where(within, shift, torch.zeros_like(shift))
+    before, after = distance.detach()[:, :-1], distance.detach()[:, 1:]
+    enters = (before > 0) & (after <= 0)
+    return torch.where(enters, before / (before - after).clamp_min(1e-9), 0.5)
 
 
 def _middles(origins: Tensor, directions: Tensor, edges: Tensor) -> Tensor:

@@ -99,15 +99,16 @@ class SurfaceField(nn.Module):
         return functional.normalize(raw + positions, dim=-1, eps=1e-6)
 
     def depths_along(
-        self,
-        point: SurfacePoint,
-        directions: Float[Tensor, "rays 3"],
-        edges: Float[Tensor, "rays edges"],
+        self, signed_distance: Float[Tensor, "rays edges"], edges: Float[Tensor, "rays edges"]
     ) -> Float[Tensor, "rays samples"]:
-        """Optical depths of the intervals of rays whose middles are `point` (rays * samples in one axis)."""
-        shape = (edges.shape[0], edges.shape[1] - 1)
-        slope = (point.gradient.view(*shape, 3) * directions[:, None]).sum(-1)
-        return optical_depth(point.signed_distance.view(shape), slope, edges[:, 1:] - edges[:, :-1], self.beta)
+        """Optical depths of the intervals of rays, from the signed distance at their ends.
+
+        Ends, not middles with a slope: beside a surface the slope of a wide interval would foretell a crossing that
+        never comes, and opaque specks with it.
+        """
+        widths = (edges[:, 1:] - edges[:, :-1]).clamp_min(1e-7)
+        before, after = signed_distance[:, :-1], signed_distance[:, 1:]
+        return optical_depth(0.5 * (before + after), (after - before) / widths, widths, self.beta)
 
 
 class _SoftplusWithSlope(torch.autograd.Function):
