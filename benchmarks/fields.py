@@ -1,0 +1,146 @@
+"""Speed of the fields: JSON on stdout.
+
+    python benchmarks/fields.py [--device cpu] [--preset embedded] [--seconds 10]
+
+Rays per second of whole training steps (forward, backward, Adam) of both fits on a synthetic sphere, and the ratio of
+the hash grid's kernel to its readable twin on 2^17 points and 16 levels, with the Jacobian, forward and backward.
+"""
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from illuminerf.fields.bounds import OccupiedCells, ball_interval
+from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss
+from illuminerf.fields.hash_grid import HashGrid, HashGridConfig, interpolate
+from illuminerf.fields.radiance_field import FieldConfig, RadianceField
+from illuminerf.fields.ray_pool import RayPool, gather_rays
+from illuminerf.fields.shading_cache import cache_shading, latent_loss
+from illuminerf.scene.cameras import sphere_cameras
+from illuminerf.workflow.device import resolve_device, torch_generator
+
+
+def seconds_per_call(call: Callable[[int], None], seconds: float, device: torch.device) -> float:
+    """Mean time of a call after three warm-up calls."""
+    for number in range(3):
+        call(number)
+    count, start = 0, time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        call(count)
+        count += 1
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+    return (time.perf_counter() - start) / count
+
+
+def sphere_pool(device: torch.device, size: int) -> RayPool:
+    """Rays of 12 views of a sphere of radius 0.6."""
+    cameras = sphere_cameras(12, 2.5, 0.7, size, size, np.random.default_rng(0))
+    masks = []
+    for view in range(len(cameras)):
+        near, far = ball_interval(*(rays.reshape(-1, 3) for rays in cameras.image_rays(view)), radius=0.6)
+        masks.append((far > near).view(size, size).numpy().astype(np.float32))
+    axis = (torch.arange(64, device=device) + 0.5) / 32 - 1
+    grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return gather_rays(cameras, np.stack(masks), OccupiedCells(grid.norm(dim=-1) < 0.65), device)
+
+
+def training_step(
+    parameters: list[torch.nn.Parameter], loss_of: Callable[[int], torch.Tensor]
+) -> Callable[[int], None]:
+    """One step of Adam on `loss_of(step)`."""
+    optimiser = torch.optim.Adam(parameters, lr=1e-4, betas=(0.9, 0.99), eps=1e-15, fused=True)
+
+    def step(number: int) -> None:
+        optimiser.zero_grad(set_to_none=True)
+        loss_of(number).backward()
+        optimiser.step()
+
+    return step
+
+
+def fits(config: FieldConfig, num_rays: int, seconds: float, device: torch.device) -> dict[str, float]:
+    """Rays per second of both fits."""
+    torch.manual_seed(0)
+    field = RadianceField(config).to(device)
+    with torch.no_grad():
+        field.surface.log_beta.fill_(-5.0)
+    pool = sphere_pool(device, 128)
+    srgb = torch.full((len(pool), 3), 0.5, device=device)
+    alpha = (torch.arange(len(pool), device=device) < pool.num_foreground).float()
+
+    def geometry(number: int) -> torch.Tensor:
+        generator = torch_generator(0, number, device=device)
+        index = pool.draw(num_rays, generator)
+        loss, _ = geometry_loss(field, GeometryLossConfig(), pool, srgb, alpha, index, 1.0, generator)
+        return loss
+
+    spent = seconds_per_call(training_step(list(field.parameters()), geometry), seconds, device)
+    result = {"geometry_rays_per_second": num_rays / spent, "geometry_step_ms": 1e3 * spent}
+
+    start = time.perf_counter()
+    pool = pool.foreground_subset(20_000, torch_generator(0, "pixels", device=device))
+    cache = cache_shading(field, pool, 4)
+    result["cache_rays_per_second"] = len(pool) / (time.perf_counter() - start)
+    codes = torch.nn.Parameter(torch.zeros(16, config.appearance.latent_width, device=device))
+    batch = 2 * num_rays
+
+    def latent(number: int) -> torch.Tensor:
+        generator = torch_generator(1, number, device=device)
+        index = torch.randint(len(pool), (batch,), generator=generator, device=device)
+        latents = torch.nn.functional.embedding(pool.view[index], codes)
+        return latent_loss(field, cache, index, srgb[index], latents, 1e-4)[0]
+
+    spent = seconds_per_call(training_step([*field.appearance.parameters(), codes], latent), seconds, device)
+    return result | {"latent_rays_per_second": batch / spent, "latent_step_ms": 1e3 * spent}
+
+
+def kernel_against_twin(seconds: float) -> dict[str, float]:
+    """Forward and backward of features and Jacobian, 2^17 points, 16 levels, CPU."""
+    grid = HashGrid(HashGridConfig(16, 2, 17, 16, 2048))
+    positions = torch.rand(1 << 17, 3, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9
+
+    def kernel(_: int) -> None:
+        features, jacobian = grid.with_jacobian(positions)
+        (features.sum() + jacobian.sum()).backward()
+
+    def twin(_: int) -> None:
+        layout = (grid._resolutions, grid._sizes, grid._offsets)
+        features, jacobian = interpolate(positions, grid.table, *layout, with_jacobian=True)
+        (features.sum() + jacobian.sum()).backward()
+
+    cpu = torch.device("cpu")
+    fast, slow = seconds_per_call(kernel, seconds, cpu), seconds_per_call(twin, seconds, cpu)
+    return {"kernel_ms": 1e3 * fast, "twin_ms": 1e3 * slow, "twin_over_kernel": slow / fast}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--preset", choices=["embedded", "paper"], default="embedded")
+    parser.add_argument("--rays", type=int, default=512)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    args = parser.parse_args()
+    device = resolve_device(args.device)
+    config = FieldConfig.paper() if args.preset == "paper" else FieldConfig.embedded()
+    result: dict[str, object] = {
+        "preset": args.preset,
+        "device": str(device) if device.type == "cpu" else torch.cuda.get_device_name(device),
+        "cpu": platform.processor() or platform.machine(),
+        "threads": torch.get_num_threads(),
+        "load_average": round(os.getloadavg()[0], 2),
+    }
+    result |= {name: round(value, 2) for name, value in fits(config, args.rays, args.seconds, device).items()}
+    if device.type == "cpu":
+        result |= {name: round(value, 2) for name, value in kernel_against_twin(args.seconds).items()}
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()
