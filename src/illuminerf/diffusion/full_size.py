@@ -92,6 +92,7 @@ def relight_photographs(
     seeds: list[list[int]],
     num_steps: int = 8,
     sampler: Sampler = "ddim",
+    temperature: float = 1.0,
 ) -> list[Float[Tensor, "samples 3 height width"]]:
     """Draw relit images of each photograph at its own size: sRGB over black in [0, 1]."""
     size = model.config.image_size
@@ -108,7 +109,7 @@ def relight_photographs(
     coded = coded.contiguous(memory_format=torch.channels_last)
 
     condition = model.condition(masked, coded)
-    decoded = sample_decoded(model, condition, seeds, num_steps, sampler)
+    decoded = sample_decoded(model, condition, seeds, num_steps, sampler, temperature)
     maps = model.conditioning.texture.maps(masked)
     results = []
     for index, (photograph, square) in enumerate(zip(photographs, squares, strict=True)):

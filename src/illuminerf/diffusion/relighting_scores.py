@@ -87,6 +87,7 @@ def evaluate(
     num_steps: int = 8,
     sampler: Sampler = "ddim",
     batch_size: int = 8,
+    temperature: float = 1.0,
 ) -> tuple[dict[str, dict[str, float]], dict[str, Float[Tensor, "pairs 3 height width"]]]:
     """Scores by estimate ({name: {psnr, ssim}}), and the images, on held-out items.
 
@@ -101,7 +102,7 @@ def evaluate(
     for start in range(0, len(pairs), batch_size):
         image, cues = batch.masked_image[start : start + batch_size], batch.coded_cues[start : start + batch_size]
         seeds = [[1000 * (start + i) + k for k in range(num_samples)] for i in range(len(image))]
-        samples.append(sample_relit(model, image, cues, seeds, num_steps, sampler))
+        samples.append(sample_relit(model, image, cues, seeds, num_steps, sampler, temperature))
         anchors.append(model.anchor(model.condition(image, cues), image[:, 3:]))
     drawn = torch.cat(samples)
     bounds = [true_composite(pair[0], example[1]) for pair, example in zip(pairs, examples, strict=True)]

@@ -37,6 +37,7 @@ def sample_decoded(
     seeds: list[list[int]],
     num_steps: int,
     sampler: Sampler,
+    temperature: float = 1.0,
 ) -> Float[Tensor, "batch samples 3 height width"]:
     """Decoded latents as they are: residuals to the anchor, or images in [-1, 1] (arguments as `sample_relit`)."""
     num_samples = len(seeds[0])
@@ -47,7 +48,8 @@ def sample_decoded(
     block = model.config.latents.block
     height, width = condition.products.shape[2:]
     shape = (model.config.latents.channels, height // block, width // block)
-    latent = torch.stack([torch.randn(shape, generator=generator) for generator in generators]).to(device)
+    noise = torch.stack([torch.randn(shape, generator=generator) for generator in generators])
+    latent = temperature * noise.to(device)
     repeated = condition.repeated(num_samples)
     scheduler = sampling_schedule(sampler, num_steps)
     extra = {"generator": generators} if sampler == "ddpm" else {}
@@ -66,6 +68,7 @@ def sample_relit(
     seeds: list[list[int]],
     num_steps: int = 8,
     sampler: Sampler = "ddim",
+    temperature: float = 1.0,
 ) -> Float[Tensor, "batch samples 3 height width"]:
     """Draw relit images: sRGB over black in [0, 1].
 
@@ -74,9 +77,12 @@ def sample_relit(
         coded_cues: straight cues under the target light, coded by `encode_cues`.
         seeds: one list per image, of equal length: one seed per sample. A seed alone decides a sample's noise,
             whatever else is in the batch.
+        num_steps: denoising steps.
+        sampler: the scheduler.
+        temperature: factor on the initial noise; below 1 samples stay nearer to their mean (not in the paper).
     """
     condition = model.condition(masked_image, coded_cues)
-    decoded = sample_decoded(model, condition, seeds, num_steps, sampler)
+    decoded = sample_decoded(model, condition, seeds, num_steps, sampler, temperature)
     alpha = masked_image[:, None, 3:]
     if not model.config.latent_is_residual:
         return ((decoded + 1) / 2).clamp(0, 1) * alpha
