@@ -30,7 +30,7 @@ class SurfaceConfig:
     """Width of the hidden layer of the predicted normals."""
     initial_radius: float = 0.5
     """The signed distance starts as a sphere of this radius."""
-    initial_beta: float = 0.05
+    initial_beta: float = 0.03
     """First value of VolSDF's beta, which is learned."""
 
     def __post_init__(self) -> None:
