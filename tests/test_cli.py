@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from illuminerf.cli import main
+from illuminerf.cli import COMMANDS, main
 from illuminerf.demo import bundled_capture
 from illuminerf.scene.images import write_png, write_rgb_exr
 
@@ -101,7 +101,11 @@ def test_benchmark_asks_for_what_it_needs(tmp_path: Path, capsys: pytest.Capture
     assert "--score" in refused(["benchmark", "tensoir", str(tmp_path), "--scenes", "hotdog"], capsys)
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["relight", "--help"], ["benchmark", "tensoir", "--help"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [["--help"], ["benchmark", "tensoir", "--help"], *([command, "--help"] for command in COMMANDS)],
+    ids=" ".join,
+)
 def test_help(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(arguments)

@@ -4,10 +4,15 @@ Photographs of an object under one unknown light go in; the same object, from an
 out. `illuminerf.pipeline` holds the whole method on one page; `relight` below is its short form.
 """
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
 __version__ = "0.1.0"
+
+# Waiting OpenMP threads that spin starve everybody, themselves included, once cores are shared: a geometry step took
+# fourteen times as long. Read when torch is imported; a value that is already set wins.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def relight(

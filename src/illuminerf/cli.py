@@ -96,7 +96,7 @@ def _stage(run: Callable[..., Path], config: type, description: str, inputs: dic
     kinds: dict[str, Any] = {
         name: kind if name in optional else Annotated[kind, tyro.conf.Positional] for name, kind in inputs.items()
     }
-    kinds |= {"out": Path, "config": Annotated[config, tyro.conf.OmitArgPrefixes]}
+    kinds |= {"out": Path, "config": Annotated[config, tyro.conf.arg(name="")]}
     defaults: dict[str, Any] = {"config": config()} | dict.fromkeys(optional)
     command.__annotations__ = kinds
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
