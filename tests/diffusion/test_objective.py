@@ -7,7 +7,7 @@ import torch
 
 from illuminerf.diffusion.augmentation import AugmentationConfig, make_batch
 from illuminerf.diffusion.cue_coding import encode_cues
-from illuminerf.diffusion.objective import Batch, LossWeights, anchor_loss, training_loss
+from illuminerf.diffusion.objective import Batch, LossWeights, anchor_loss, rescaled_products, training_loss
 from illuminerf.diffusion.training_items import load_items
 from illuminerf.diffusion.training_state import WeightAverage, learning_rate
 from illuminerf.scene.images import srgb_from_linear
@@ -36,6 +36,15 @@ def test_brighter_than_saturated_is_free_but_brighter_than_the_truth_is_not() ->
     assert float(anchor_loss(products, batch)) < 1e-6
     darker = batch._replace(target=0.9 * batch.target)
     assert float(anchor_loss(products, darker)) > 1e-3
+
+
+def test_rescaled_products_take_out_a_gain_per_channel_and_nothing_else() -> None:
+    products, batch = lambertian_batch(brightness=0.15)
+    gain = torch.tensor([0.5, 1.0, 2.0]).repeat(4)[:, None, None]
+    dimmed = encode_cues(gain * products**2.2)
+    assert float(anchor_loss(rescaled_products(dimmed, batch), batch)) < 1e-6 < float(anchor_loss(dimmed, batch))
+    shaded = products * torch.linspace(0.5, 1, 16)
+    assert float(anchor_loss(rescaled_products(shaded, batch), batch)) > 1e-4
 
 
 def test_learning_rate_by_hand() -> None:

@@ -9,8 +9,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from illuminerf.diffusion.conditioning import Condition
-from illuminerf.diffusion.cue_coding import composited_srgb
+from illuminerf.diffusion.cue_coding import GAMMA, composited_srgb, decode_cues
 from illuminerf.diffusion.relighting_model import NUM_TRAIN_TIMESTEPS, RelightingModel, noise_schedule
+from illuminerf.scene.images import linear_from_srgb
 
 
 class Batch(NamedTuple):
@@ -28,13 +29,16 @@ class LossWeights:
 
     anchor: float = 20.0
     """Squared sRGB error of the composited products, per covered pixel."""
+    rescaled_anchor: float = 0.0
+    """The same after the least-squares gain per image and channel: a single image cannot tell albedo from exposure,
+    and without this term that part of the error outweighs shading and gloss."""
     diffusion: float = 1.0
     """Squared error of v, per covered latent coefficient."""
     outside: float = 0.05
     """Weight of latents without any covered pixel, beside 1 for the others."""
 
     def __post_init__(self) -> None:
-        if min(self.anchor, self.diffusion, self.outside) < 0:
+        if min(self.anchor, self.rescaled_anchor, self.diffusion, self.outside) < 0:
             raise ValueError("loss weights are not negative")
 
 
@@ -48,6 +52,19 @@ def stratified_timesteps(batch: int, generator: torch.Generator) -> Int[Tensor, 
     """Uniform timesteps, one from each of `batch` equal strata, shuffled: less variance than independent draws."""
     offsets = (torch.arange(batch) + torch.rand(batch, generator=generator)) / batch
     return (offsets[torch.randperm(batch, generator=generator)] * NUM_TRAIN_TIMESTEPS).long()
+
+
+def rescaled_products(
+    products: Float[Tensor, "batch 12 height width"], batch: Batch
+) -> Float[Tensor, "batch 12 height width"]:
+    """Products times the gain per image and channel that brings their composite nearest to the target (linear light,
+    gain without gradient, within a factor of 4)."""
+    ours = decode_cues(products.detach()).unflatten(1, (4, 3)).sum(1)
+    truth = linear_from_srgb(batch.target / batch.alpha.clamp_min(1e-3))
+    weight = batch.alpha * (batch.target < batch.alpha)
+    gain = (ours * truth * weight).sum((2, 3)) / (ours.square() * weight).sum((2, 3)).clamp_min(1e-6)
+    coded = gain.clamp(0.25, 4.0) ** (1 / GAMMA)
+    return products * coded[:, :, None, None].repeat(1, 4, 1, 1)
 
 
 def anchor_loss(products: Float[Tensor, "batch 12 height width"], batch: Batch) -> Float[Tensor, ""]:
@@ -76,6 +93,9 @@ def training_loss(
         anchor = anchor_loss(condition.products, batch)
         parts["anchor"] = float(anchor.detach())
         loss = loss + weights.anchor * anchor if anchor.requires_grad else loss
+        if weights.rescaled_anchor > 0 and anchor.requires_grad:
+            rescaled = anchor_loss(rescaled_products(condition.products, batch), batch)
+            loss, parts["rescaled"] = loss + weights.rescaled_anchor * rescaled, float(rescaled.detach())
     if weights.diffusion > 0:
         diffusion = _diffusion_loss(model, batch, condition, generator, weights.outside, scale_momentum)
         loss, parts["diffusion"] = loss + weights.diffusion * diffusion, float(diffusion.detach())
