@@ -43,6 +43,8 @@ EMBEDDED = Preset(
     name="embedded",
     description="The default: for two CPU cores and photographs of about 200 pixels; a GPU makes it faster.",
     capture=import_capture.Config(size=200),
+    # the weights were trained on cues of this noise; the distillation averages over views and samples
+    cues=render_radiance_cues.Config(sampling=CueSampling(samples_per_pixel=16)),
 )
 
 DEMO = dataclasses.replace(
@@ -50,8 +52,7 @@ DEMO = dataclasses.replace(
     name="demo",
     description="The bundled capture in minutes on two CPU cores: fewer steps and samples than `embedded`.",
     capture=import_capture.Config(),
-    geometry=estimate_geometry.Config(optimiser=OptimiserConfig(num_steps=1000)),
-    cues=render_radiance_cues.Config(sampling=CueSampling(samples_per_pixel=32)),
+    geometry=estimate_geometry.Config(optimiser=OptimiserConfig(num_steps=2000)),
     relighting=relight_views.Config(num_samples=4),
     latent_nerf=fit_latent_nerf.Config(optimiser=OptimiserConfig(num_steps=1500, rays_per_step=1024, warmup_steps=30)),
     turntable=render_novel_views.Config(
