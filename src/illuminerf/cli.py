@@ -1,11 +1,11 @@
 """The command line: one subcommand per stage, plus `relight` and `demo` that run them all."""
 
-import inspect
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import field, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
@@ -84,36 +84,34 @@ def presets_command() -> None:
         say(f"[bold]{preset.name}[/bold]: {preset.description}")
 
 
-def _stage(run: Callable[..., Path], config: type, description: str, inputs: dict[str, Any]) -> Callable[..., None]:
+class StageCall:
+    """Parsed arguments of one stage's subcommand."""
+
+    run: ClassVar[Callable[..., Path]]
+    inputs: ClassVar[tuple[str, ...]]
+
+    def execute(self) -> None:
+        """Run the stage."""
+        out: Path = getattr(self, "out")  # noqa: B009
+        type(self).run(*(getattr(self, name) for name in self.inputs), getattr(self, "config"), out)  # noqa: B009
+        say(f"done: {out}")
+
+
+def _stage(run: Callable[..., Path], config: type, description: str, inputs: dict[str, Any]) -> type[StageCall]:
     """A subcommand of one stage: its inputs as positional arguments, its config's fields as options, and --out."""
-
-    def command(*arguments: Any, **options: Any) -> None:
-        run(*(options[name] for name in inputs), options["config"], options["out"])
-        say(f"done: {options['out']}")
-
-    command.__doc__ = description
-    optional = {name for name, kind in inputs.items() if kind == Path | None}
-    kinds: dict[str, Any] = {
-        name: kind if name in optional else Annotated[kind, tyro.conf.Positional] for name, kind in inputs.items()
-    }
-    kinds |= {"out": Path, "config": Annotated[config, tyro.conf.arg(name="")]}
-    defaults: dict[str, Any] = {"config": config()} | dict.fromkeys(optional)
-    command.__annotations__ = kinds
-    command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [
-            inspect.Parameter(
-                name,
-                inspect.Parameter.KEYWORD_ONLY,
-                annotation=kind,
-                default=defaults.get(name, inspect.Parameter.empty),
-            )
-            for name, kind in kinds.items()
-        ]
-    )
-    return command
+    fields: list[tuple[str, Any, Any]] = []
+    for name, kind in inputs.items():
+        is_optional = kind == Path | None
+        argument = kind if is_optional else Annotated[kind, tyro.conf.Positional]
+        fields.append((name, argument, field(default=None) if is_optional else field()))
+    fields.append(("out", Path, field()))
+    fields.append(("config", Annotated[config, tyro.conf.arg(name="")], field(default_factory=config)))
+    call = make_dataclass("Stage", fields, bases=(StageCall,), kw_only=True)
+    call.run, call.inputs, call.__doc__ = staticmethod(run), tuple(inputs), description  # type: ignore[attr-defined]
+    return call
 
 
-COMMANDS: dict[str, Callable[..., None]] = {
+COMMANDS: dict[str, Callable[..., Any]] = {
     "relight": relight_command,
     "demo": demo_command,
     "presets": presets_command,
@@ -184,12 +182,14 @@ def main(arguments: list[str] | None = None) -> None:
             group = arguments[0]
             tyro.extras.subcommand_cli_from_dict(GROUPS[group], prog=f"illuminerf {group}", args=arguments[1:])
         else:
-            tyro.extras.subcommand_cli_from_dict(
+            chosen = tyro.extras.subcommand_cli_from_dict(
                 COMMANDS,
                 prog="illuminerf",
                 description="Relight photographed objects. Also: illuminerf benchmark tensoir --help",
                 args=arguments,
             )
+            if isinstance(chosen, StageCall):
+                chosen.execute()
     except UserError as error:
         console.print(f"[bold red]error:[/bold red] {error}", highlight=False, markup=True)
         sys.exit(2)
