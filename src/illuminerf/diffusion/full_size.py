@@ -118,11 +118,10 @@ def relight_photographs(
         if model.config.latent_is_residual:
             linear = cut_out(photograph.linear_cues, square)[None]
             texture = model.conditioning.texture.texture(resized(maps[index : index + 1], side), piece[:, :3])
-            relit = relit + composited_srgb(texture * encode_cues(linear)).clamp_max(1)
+            relit = relit + composited_srgb(texture * encode_cues(linear)).clamp_max(1) * piece[:, 3:]
         else:
             relit = (relit + 1) / 2
         height, width = photograph.masked_image.shape[1:]
-        results.append(
-            torch.stack([put_back(image, square, height, width) for image in relit.clamp(0, 1) * piece[:, 3:]])
-        )
+        relit = torch.minimum(relit.clamp_min(0), piece[:, 3:])
+        results.append(torch.stack([put_back(image, square, height, width) for image in relit]))
     return results

@@ -83,7 +83,9 @@ def sample_relit(
     """
     condition = model.condition(masked_image, coded_cues)
     decoded = sample_decoded(model, condition, seeds, num_steps, sampler, temperature)
-    alpha = masked_image[:, None, 3:]
-    if not model.config.latent_is_residual:
-        return ((decoded + 1) / 2).clamp(0, 1) * alpha
-    return (decoded + model.anchor(condition, masked_image[:, 3:])[:, None]).clamp(0, 1) * alpha
+    if model.config.latent_is_residual:
+        relit = decoded + model.anchor(condition, masked_image[:, 3:])[:, None]
+    else:
+        relit = (decoded + 1) / 2
+    # Over black no value exceeds the coverage; multiplying would darken partly covered pixels twice.
+    return torch.minimum(relit.clamp_min(0), masked_image[:, None, 3:])
