@@ -45,6 +45,8 @@ EMBEDDED = Preset(
     capture=import_capture.Config(size=200),
     # the weights were trained on cues of this noise; the distillation averages over views and samples
     cues=render_radiance_cues.Config(sampling=CueSampling(samples_per_pixel=16)),
+    latent_nerf=fit_latent_nerf.Config(optimiser=OptimiserConfig(num_steps=2000, rays_per_step=1024, warmup_steps=40)),
+    turntable=render_novel_views.Config(turntable=render_novel_views.TurntableConfig(num_views=36)),
 )
 
 DEMO = dataclasses.replace(

@@ -79,8 +79,24 @@ def nearest_point_to_rays(origins: np.ndarray, directions: np.ndarray) -> np.nda
 
 
 def hull_ball(cameras: Cameras, masks: Sequence[np.ndarray]) -> Ball:
-    """The ball about the visual hull of `masks`: one bool [rows, columns] per camera, of any resolution."""
-    ball = _ball_of_masks(cameras, masks)
+    """The ball about the visual hull of `masks`: one bool [rows, columns] per camera, of any resolution.
+
+    Where no camera looks from below (or above), the hull runs on into a cone behind the object. Then the ball that
+    the outlines ask for is the smaller one, and it is taken.
+    """
+    carved, outlined = _carved_ball(cameras, masks), outline_ball(cameras, masks)
+    return outlined if outlined.radius < carved.radius else carved
+
+
+def outline_ball(cameras: Cameras, masks: Sequence[np.ndarray]) -> Ball:
+    """The ball about the point nearest to the rays through the masks' middles that covers every mask."""
+    centre, spread, off_axis = _outlines(cameras, masks)
+    return Ball(centre, float((spread + off_axis).max()))
+
+
+def _carved_ball(cameras: Cameras, masks: Sequence[np.ndarray]) -> Ball:
+    centre, spread, _ = _outlines(cameras, masks)
+    ball = Ball(centre, 1.3 * float(np.median(spread)))
     for _ in range(6):  # until the hull lies inside the grid: the first guess rests on the outlines alone
         kept, step = _carve(cameras, masks, ball)
         outermost = np.abs(kept - ball.centre).max() if len(kept) else 0.0
@@ -105,9 +121,9 @@ def _ball_around(voxels: np.ndarray, step: float) -> Ball:
     return Ball(centre, float(np.linalg.norm(voxels - centre, axis=-1).max() + step / 2))
 
 
-def _ball_of_masks(cameras: Cameras, masks: Sequence[np.ndarray]) -> Ball:
-    """A first guess: the point nearest to the rays through the masks' centres, and the masks' extent
-    there.
+def _outlines(cameras: Cameras, masks: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The point nearest to the rays through the masks' middles; per mask its radius at that point's distance, and by
+    how much its ray misses the point, in world units.
     """
     directions, spreads = [], []
     for view, mask in enumerate(masks):
@@ -120,9 +136,12 @@ def _ball_of_masks(cameras: Cameras, masks: Sequence[np.ndarray]) -> Ball:
         spreads.append(float(np.linalg.norm(plane - middle, axis=-1).max()))
         world = cameras.world_from_camera[view, :3, :3] @ middle
         directions.append(world / np.linalg.norm(world))
-    centre = nearest_point_to_rays(cameras.positions, np.stack(directions))
-    distances = np.linalg.norm(centre - cameras.positions, axis=-1)
-    return Ball(centre, float(np.median(distances * np.array(spreads))) * 1.3)
+    rays = np.stack(directions)
+    centre = nearest_point_to_rays(cameras.positions, rays)
+    away = centre - cameras.positions
+    distance = np.linalg.norm(away, axis=-1)
+    off_axis = np.linalg.norm(away - np.sum(away * rays, axis=-1, keepdims=True) * rays, axis=-1)
+    return centre, distance * np.array(spreads), off_axis
 
 
 def _carve(cameras: Cameras, masks: Sequence[np.ndarray], ball: Ball) -> tuple[np.ndarray, float]:

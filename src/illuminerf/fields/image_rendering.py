@@ -31,6 +31,37 @@ class RenderedImage:
 
 
 @torch.no_grad()
+def observed_cells(
+    field: RadianceField, cells: OccupiedCells, cameras: Cameras, min_weight: float = 0.02, stride: int = 2
+) -> OccupiedCells:
+    """Those of `cells` in which some camera sees something, and their neighbours.
+
+    What no photograph shows, such as the space below an object on a table, holds whatever the fit began with; it would
+    float about in novel views.
+
+    Args:
+        min_weight: rendering weight from which a sample counts as seen.
+        stride: every `stride`-th row and column is asked.
+    """
+    device = cells.cells.device
+    seen = torch.zeros_like(cells.cells)
+    side = seen.shape[0]
+    rows, columns = (torch.arange(0, size, stride, device=device) for size in (cameras.height, cameras.width))
+    pixel = (rows[:, None] * cameras.width + columns).view(-1)
+    for view in range(len(cameras)):
+        origins, directions = pixel_rays(cameras, torch.full_like(pixel, view), pixel)
+        near, far = cells.clip(origins, directions)
+        hit = far > near
+        if not hit.any():
+            continue
+        samples = field.sample(origins[hit], directions[hit], near[hit], far[hit])
+        points = samples.positions[samples.weights > min_weight]
+        x, y, z = (points * (side / 2) + side / 2).long().clamp(0, side - 1).unbind(-1)
+        seen[x, y, z] = True
+    return OccupiedCells(OccupiedCells(seen).dilated(1).cells & cells.cells)
+
+
+@torch.no_grad()
 def render_image(
     field: RadianceField,
     cells: OccupiedCells,

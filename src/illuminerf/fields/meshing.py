@@ -16,7 +16,11 @@ _CHUNK = 1 << 17
 
 @torch.no_grad()
 def extract_mesh(
-    surface: SurfaceField, cells: OccupiedCells, resolution: int, min_component_share: float = 0.01
+    surface: SurfaceField,
+    cells: OccupiedCells,
+    resolution: int,
+    min_component_share: float = 0.01,
+    observed: OccupiedCells | None = None,
 ) -> TriangleMesh:
     """Marching cubes at zero, with predicted normals as vertex normals.
 
@@ -25,6 +29,7 @@ def extract_mesh(
         cells: the distance is evaluated in these cells only; elsewhere it counts as outside.
         resolution: points per axis over the box of the occupied cells.
         min_component_share: connected components smaller than this share of the largest one's area are dropped.
+        observed: components without a vertex in these cells are dropped too.
 
     Raises:
         UserError: the distance has no zero crossing.
@@ -51,14 +56,21 @@ def extract_mesh(
         )
     # inside is below outside, and faces come out counter-clockwise seen from outside (held by a test)
     vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
-    vertices, faces = _large_components(vertices + low, faces, min_component_share)
+    vertices = vertices + low
+    if observed is not None:
+        is_seen = observed.contains(torch.from_numpy(vertices.astype(np.float32)).to(device)).cpu().numpy()
+        vertices, faces = _large_components(vertices, faces, min_component_share, is_seen)
+    else:
+        vertices, faces = _large_components(vertices, faces, min_component_share)
     positions = torch.from_numpy(vertices.astype(np.float32)).to(device)
     normals = torch.cat([surface.predicted_normals(chunk) for chunk in positions.split(_CHUNK)])
     return TriangleMesh(positions.cpu().numpy(), faces.astype(np.int32), normals.cpu().numpy())
 
 
-def _large_components(vertices: np.ndarray, faces: np.ndarray, min_share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Drop components whose area is below a share of the largest one's, and vertices no face uses."""
+def _large_components(
+    vertices: np.ndarray, faces: np.ndarray, min_share: float, is_seen: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Drop components that no camera saw or whose area is below a share of the largest one's, and unused vertices."""
     first = np.concatenate([faces[:, 0], faces[:, 1]])
     second = np.concatenate([faces[:, 1], faces[:, 2]])
     links = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(len(vertices),) * 2)
@@ -66,6 +78,8 @@ def _large_components(vertices: np.ndarray, faces: np.ndarray, min_share: float)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
     area_of = np.bincount(label[faces[:, 0]], area, minlength=count)
+    if is_seen is not None and is_seen.any():
+        area_of *= np.bincount(label, is_seen, minlength=count) > 0
     faces = faces[area_of[label[faces[:, 0]]] >= min_share * area_of.max()]
     used, renumbered = np.unique(faces, return_inverse=True)
     return vertices[used], renumbered.reshape(-1, 3)

@@ -10,7 +10,7 @@ import torch
 from illuminerf.data.capture import load_capture
 from illuminerf.fields.bounds import OccupiedCells, visual_hull
 from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss, start_from_cells
-from illuminerf.fields.image_rendering import render_image
+from illuminerf.fields.image_rendering import observed_cells, render_image
 from illuminerf.fields.meshing import extract_mesh
 from illuminerf.fields.optimisation import OptimiserConfig, fit
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
@@ -88,9 +88,13 @@ def run(capture_path: Path, config: Config, out: Path) -> Path:
         _fit(radiance_field, hull, views, fitted, has_masks, config, out / "checkpoint.safetensors")
         fit_seconds = time.monotonic() - start
 
-        cells = surface_cells(radiance_field.surface, hull)
+        near_surface = surface_cells(radiance_field.surface, hull)
+        cells = observed_cells(radiance_field, near_surface, views.cameras)
         save_field(out, StoredField(radiance_field, cells))
-        mesh = extract_mesh(radiance_field.surface, cells, config.mesh_resolution, config.min_component_share)
+        # unobserved parts of observed components stay: they close the mesh against light from behind
+        mesh = extract_mesh(
+            radiance_field.surface, near_surface, config.mesh_resolution, config.min_component_share, cells
+        )
         mesh.save_glb(out / "mesh.glb")
         _save_previews(radiance_field, cells, views, config.num_previews, out / "normals")
         scores = [_psnr(radiance_field, cells, views, view) for view in held_out]
