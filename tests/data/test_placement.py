@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from illuminerf.data.placement import Ball, focus_ball, hull_ball, mask_preview, nearest_point_to_rays
+from illuminerf.data.placement import Ball, focus_ball, hull_ball, mask_preview, nearest_point_to_rays, outline_ball
 from illuminerf.scene.cameras import Cameras, look_at, sphere_cameras
 from illuminerf.workflow.errors import UserError
 from tests.data.synthetic_capture import CENTRE, RADIUS, ball_cameras, ball_images
@@ -18,6 +18,22 @@ def test_the_hull_of_a_ball_is_a_little_larger_than_the_ball() -> None:
     ball = hull_ball(CAMERAS, MASKS)
     assert np.linalg.norm(ball.centre - CENTRE) < 0.1 * RADIUS
     assert RADIUS <= ball.radius < 1.35 * RADIUS
+
+
+def test_cameras_from_above_only_do_not_stretch_the_ball() -> None:
+    """Below the object the hull is a cone without end; the outlines are not fooled."""
+    band = (np.radians(20), np.radians(70))
+    cameras = sphere_cameras(24, 3.0, 0.7, 60, 60, np.random.default_rng(1), *band)
+    masks = []
+    for view in range(len(cameras)):
+        origins, directions = (rays.numpy() for rays in cameras.image_rays(view))
+        along = -(origins * directions).sum(-1)
+        masks.append(np.linalg.norm(origins + along[..., None] * directions, axis=-1) < 0.5)
+    ball = hull_ball(cameras, masks)
+    assert np.linalg.norm(ball.centre) < 0.05
+    assert 0.5 <= ball.radius < 0.5 * 1.25
+    outlined = outline_ball(cameras, masks)
+    assert 0.5 <= outlined.radius < 0.5 * 1.25
 
 
 def test_one_bad_mask_does_not_carve_the_object_away() -> None:

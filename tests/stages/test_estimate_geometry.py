@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from illuminerf.data.capture import load_capture
 from illuminerf.fields import optimisation
 from illuminerf.fields.appearance import AppearanceConfig
 from illuminerf.fields.geometry_fit import GeometryLossConfig
 from illuminerf.fields.hash_grid import HashGridConfig
+from illuminerf.fields.image_rendering import observed_cells
 from illuminerf.fields.optimisation import OptimiserConfig
 from illuminerf.fields.proposal_sampling import ProposalConfig
 from illuminerf.fields.radiance_field import FieldConfig
@@ -107,6 +109,21 @@ def test_stored_field_has_tight_cells(geometry: Path) -> None:
     stored = load_field(geometry)
     assert bool(stored.cells.contains(torch.tensor([[0.58, 0, 0], [0.0, -0.58, 0]])).all())
     assert not bool(stored.cells.contains(torch.tensor([[0.9, 0, 0], [0.0, 0.0, 0.95]])).any())
+
+
+def test_what_no_photograph_shows_is_not_kept(geometry: Path, sphere_capture: Path) -> None:
+    """Seen from one side only, the far side of the ball is unobserved; from all sides the cells stay."""
+    stored = load_field(geometry)
+    cameras = load_capture(sphere_capture).views.cameras
+    everywhere = observed_cells(stored.field, stored.cells, cameras)
+    one_side = observed_cells(stored.field, stored.cells, cameras[0])
+    towards = torch.from_numpy(cameras.positions[0]).float()
+    towards = towards / towards.norm()
+    side = stored.cells.cells.shape[0]
+    depth = ((one_side.cells.nonzero() + 0.5) * 2 / side - 1) @ towards
+    assert everywhere.cells.sum() > 0.8 * stored.cells.cells.sum()
+    assert one_side.cells.sum() < 0.75 * everywhere.cells.sum()
+    assert (depth > 0).float().mean() > 0.7
 
 
 def test_configs_survive_json_and_refuse_nonsense() -> None:
