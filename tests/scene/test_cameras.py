@@ -20,9 +20,7 @@ def test_the_central_ray_points_at_the_target() -> None:
 
 
 def test_axes_are_opengl_in_a_z_up_world() -> None:
-    batch = turntable_cameras(
-        4, 2.0, 0.8, 10, 10, elevation_radians=0.0
-    )  # view 0 sits on +x and looks along -x
+    batch = turntable_cameras(4, 2.0, 0.8, 10, 10, elevation_radians=0.0)  # view 0 sits on +x and looks along -x
     _, directions = batch.image_rays(0)
     assert directions[0, 5, 2] > directions[9, 5, 2], "the top row must look up"
     assert directions[5, 9, 1] > directions[5, 0, 1], "from +x, the right of the picture is +y"

@@ -24,9 +24,7 @@ def lamp(azimuth: float, elevation: float, height: int = 32) -> EnvironmentMap:
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:
-    return np.array(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-    )
+    return np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
 
 
 def brightest(light: EnvironmentMap) -> np.ndarray:
@@ -55,9 +53,7 @@ def test_rotation_turns_counter_clockwise_from_above(turn: float) -> None:
 
 
 def test_a_full_turn_changes_nothing() -> None:
-    np.testing.assert_allclose(
-        random_light().rotated(2 * np.pi).linear_rgb, random_light().linear_rgb, atol=1e-5
-    )
+    np.testing.assert_allclose(random_light().rotated(2 * np.pi).linear_rgb, random_light().linear_rgb, atol=1e-5)
 
 
 def test_solid_angles_cover_the_sphere_and_a_constant_light_has_its_mean() -> None:
@@ -81,9 +77,7 @@ def test_chrome_ball_mirrors_what_is_behind_the_camera_in_its_middle() -> None:
 
 def test_files_round_trip(tmp_path: Path) -> None:
     random_light().save(tmp_path / "light.exr")
-    np.testing.assert_array_equal(
-        EnvironmentMap.load(tmp_path / "light.exr").linear_rgb, random_light().linear_rgb
-    )
+    np.testing.assert_array_equal(EnvironmentMap.load(tmp_path / "light.exr").linear_rgb, random_light().linear_rgb)
 
 
 def test_ldr_is_decoded_with_a_warning(tmp_path: Path) -> None:
