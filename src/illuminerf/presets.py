@@ -43,7 +43,7 @@ EMBEDDED = Preset(
     name="embedded",
     description="The default: for two CPU cores and photographs of about 200 pixels; a GPU makes it faster.",
     capture=import_capture.Config(size=200),
-    # the weights were trained on cues of this noise; the distillation averages over views and samples
+    # cheap; noise of the cues reaches the samples, and the distillation averages over views
     cues=render_radiance_cues.Config(sampling=CueSampling(samples_per_pixel=16)),
     latent_nerf=fit_latent_nerf.Config(optimiser=OptimiserConfig(num_steps=2000, rays_per_step=1024, warmup_steps=40)),
     turntable=render_novel_views.Config(turntable=render_novel_views.TurntableConfig(num_views=36)),
@@ -55,6 +55,7 @@ DEMO = dataclasses.replace(
     description="The bundled capture in minutes on two CPU cores: fewer steps and samples than `embedded`.",
     capture=import_capture.Config(),
     geometry=estimate_geometry.Config(optimiser=OptimiserConfig(num_steps=2000)),
+    cues=render_radiance_cues.Config(sampling=CueSampling(samples_per_pixel=64)),
     relighting=relight_views.Config(num_samples=4),
     latent_nerf=fit_latent_nerf.Config(optimiser=OptimiserConfig(num_steps=1500, rays_per_step=1024, warmup_steps=30)),
     turntable=render_novel_views.Config(
