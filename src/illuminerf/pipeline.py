@@ -37,6 +37,8 @@ from illuminerf.workflow.atomic import atomic_path, read_json, write_json
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say
 
+_SECONDS_PER_TURN = 4.0
+
 
 @dataclass(frozen=True)
 class LightJob:
@@ -99,7 +101,8 @@ def relight_under(capture: Path, geometry: Path, light: Path, preset: Preset, ou
     if not video.exists():
         frames = sorted((turntable / "images").glob("*.png"))
         images = (read_png(frame) for frame in frames)
-        write_mp4(video, (composite(image[..., :3], image[..., 3], 1.0) for image in images))
+        on_white = (composite(image[..., :3], image[..., 3], 1.0) for image in images)
+        write_mp4(video, on_white, frames_per_second=max(1, round(len(frames) / _SECONDS_PER_TURN)))
     return {"cues": cues, "relit": relit, "latent_nerf": latent_nerf, "turntable": turntable, "video": video}
 
 

@@ -44,7 +44,7 @@ def write_report(
         stages: artefacts all lights share: "capture", "geometry".
         lights: for each light's name its artefacts: "cues", "relit", "latent_nerf", "turntable", and the file
             "video" where there is one.
-        scores: rows to print under "Scores", or None.
+        scores: by light, {"psnr": dB, "ssim": ...}, where there is truth.
     """
     body = [f"<h1>{html.escape(run.resolve().name)}</h1><p class=note>Open IllumiNeRF: one object, relit.</p>"]
     body += [_inputs(stages["capture"]), _geometry(stages["geometry"])]
@@ -70,7 +70,7 @@ def _inputs(capture: Path) -> str:
 
 def _geometry(geometry: Path) -> str:
     normals = sorted((geometry / "normals").glob("*.png"))
-    pictures = [(read_png(path)[..., :3], f"normals {path.stem}") for path in _spread(normals)]
+    pictures = [(_on_white(read_png(path)), f"normals {path.stem}") for path in _spread(normals)]
     return f"<h2>Geometry</h2>{_row(pictures)}"
 
 
@@ -128,10 +128,9 @@ def _samples(relit: Path, capture: Path) -> str:
 
 
 def _scores(scores: dict[str, Any]) -> str:
-    rows = "".join(
-        f"<tr><td>{html.escape(str(name))}</td><td>{value:.3f}</td></tr>"
-        for name, value in scores.items()
-        if isinstance(value, (int, float))
+    rows = "<tr><th>light</th><th>PSNR, dB</th><th>SSIM</th></tr>" + "".join(
+        f"<tr><td>{html.escape(light)}</td><td>{values['psnr']:.2f}</td><td>{values['ssim']:.3f}</td></tr>"
+        for light, values in scores.items()
     )
     note = "<p class=note>On views that were not photographed, per-channel rescaled as in the TensoIR benchmark.</p>"
     return f"<h2>Scores</h2>{note}<table>{rows}</table>"
