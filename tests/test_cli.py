@@ -116,3 +116,9 @@ def test_help(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
 def test_presets_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     main(["presets"])
     assert "embedded" in capsys.readouterr().err
+
+
+def test_a_relighting_model_is_scored_on_rendered_pairs_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "no training items" in refused(["evaluate-rdm", "embedded", str(tmp_path)], capsys)

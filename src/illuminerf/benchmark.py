@@ -5,14 +5,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
+from rich.table import Table
 
 from illuminerf import pipeline
 from illuminerf.data.tensoir import load_test_cameras
+from illuminerf.diffusion.pretrained import pretrained_model
+from illuminerf.diffusion.relighting_scores import evaluate
+from illuminerf.diffusion.training_items import load_items
 from illuminerf.evaluation.tables import cell_table, published_table
 from illuminerf.presets import Preset, customised
 from illuminerf.scene.images import composite, read_png, write_png
 from illuminerf.stages.score_predictions import score_input_light, score_predictions
 from illuminerf.workflow.atomic import write_json
+from illuminerf.workflow.device import resolve_device
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import console
 
@@ -69,6 +74,53 @@ def tensoir_command(
     scores["peak_memory_gb"] = {scene: pipeline.peak_memory_gb(out / scene) for scene in scenes}
     write_json(out / "scores.json", scores)
     _report(scores, f"{len(scenes)} scenes, {len(lights)} lights, every {every}", json)
+
+
+def relighting_model_command(
+    model: tyro.conf.Positional[str],
+    data: tyro.conf.Positional[Path],
+    json: Path | None = None,
+    pairs: int = 48,
+    samples: int = 4,
+    steps: int = 4,
+    temperature: float = 0.6,
+    device: str = "auto",
+) -> None:
+    """Score a relighting model on rendered pairs of held-out objects and lights (see docs/model_card.md).
+
+    Args:
+        model: A model folder, or the word embedded.
+        data: What render-training-pairs made of held-out objects and lights.
+        json: Write the scores here.
+        pairs: How many (input light, target light) pairs, spread over the renders.
+        samples: Samples per pair.
+        steps: Denoising steps.
+        temperature: Factor on the initial noise.
+        device: auto, cpu or cuda.
+    """
+    network = pretrained_model(model, resolve_device(device))
+    items = load_items(data, network.config.image_size)
+    scores, _ = evaluate(network, items, pairs, samples, steps, temperature=temperature)
+    named = {
+        "psnr": scores["sample"]["psnr"],
+        "psnr_mean_of_samples": scores["mean"]["psnr"],
+        "psnr_input": scores["input"]["psnr"],
+        "psnr_albedo_cue": scores["mean_albedo"]["psnr"],
+        "psnr_products": scores["anchor"]["psnr"],
+        "psnr_upper_bound": scores["bound"]["psnr"],
+        "ssim_mean_of_samples": scores["mean"]["ssim"],
+        "ssim_input": scores["input"]["ssim"],
+        "spread": scores["spread"]["srgb"],
+    }
+    if json is not None:
+        write_json(json, named | {"renders": len(items), "pairs": pairs, "samples": samples, "steps": steps})
+    table = Table(title=f"Relighting model on {len(items)} renders, {pairs} pairs: PSNR over the object, rescaled")
+    table.add_column("estimate")
+    table.add_column("PSNR", justify="right")
+    for name, value in named.items():
+        if name.startswith("psnr"):
+            table.add_row(name.removeprefix("psnr_").replace("psnr", "one sample").replace("_", " "), f"{value:.2f}")
+    console.print(table)
 
 
 def relight_scene(

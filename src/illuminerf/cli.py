@@ -166,6 +166,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
         "Train a relighting diffusion model on rendered pairs.",
         {"pairs": Path, "heldout": Path},
     ),
+    "evaluate-rdm": benchmark.relighting_model_command,
     "render-demo-capture": _stage(
         render_demo_capture.run, render_demo_capture.Config, "Render the bundled demo capture from its formulas.", {}
     ),
