@@ -12,9 +12,10 @@ from illuminerf.data.tensoir import load_test_cameras
 from illuminerf.diffusion.pretrained import pretrained_model
 from illuminerf.diffusion.relighting_scores import evaluate
 from illuminerf.diffusion.training_items import load_items
+from illuminerf.evaluation.benchmark_rule import on_white
 from illuminerf.evaluation.tables import cell_table, published_table
 from illuminerf.presets import Preset, customised
-from illuminerf.scene.images import composite, read_png, write_png
+from illuminerf.scene.images import read_png, write_png
 from illuminerf.stages.score_predictions import score_input_light, score_predictions
 from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.device import resolve_device
@@ -136,8 +137,7 @@ def relight_scene(
         rendered = out / scene.name / "lights" / light / "test_views" / "images"
         for view, name in enumerate(names):
             image = read_png(rendered / f"{view:03d}.png")
-            on_white = composite(image[..., :3], image[..., 3], 1.0)
-            write_png(out / "predictions" / scene.name / light / f"{name}.png", on_white)
+            write_png(out / "predictions" / scene.name / light / f"{name}.png", on_white(image))
 
 
 def _light(folder: Path, name: str) -> Path:

@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from illuminerf.data.capture import load_capture
+from illuminerf.evaluation.benchmark_rule import on_white
 from illuminerf.presets import Preset
 from illuminerf.report import write_report
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.environment import EnvironmentMap
-from illuminerf.scene.images import composite, read_png
+from illuminerf.scene.images import read_png
 from illuminerf.scene.video import write_mp4
 from illuminerf.stages import (
     estimate_geometry,
@@ -100,9 +101,11 @@ def relight_under(capture: Path, geometry: Path, light: Path, preset: Preset, ou
     video = out / "turntable.mp4"
     if not video.exists():
         frames = sorted((turntable / "images").glob("*.png"))
-        images = (read_png(frame) for frame in frames)
-        on_white = (composite(image[..., :3], image[..., 3], 1.0) for image in images)
-        write_mp4(video, on_white, frames_per_second=max(1, round(len(frames) / _SECONDS_PER_TURN)))
+        write_mp4(
+            video,
+            (on_white(read_png(frame)) for frame in frames),
+            frames_per_second=max(1, round(len(frames) / _SECONDS_PER_TURN)),
+        )
     return {"cues": cues, "relit": relit, "latent_nerf": latent_nerf, "turntable": turntable, "video": video}
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from illuminerf.evaluation.benchmark_rule import on_white
 from illuminerf.scene.environment import EnvironmentMap, chrome_ball
 from illuminerf.scene.images import composite, read_exr, read_png, srgb_from_linear, to_uint8
 from illuminerf.workflow.artefact import read_metrics
@@ -64,13 +65,13 @@ def write_report(
 
 def _inputs(capture: Path) -> str:
     files = sorted((capture / "images").glob("*.png"))
-    pictures = [(_on_white(read_png(path)), path.stem) for path in _spread(files)]
+    pictures = [(on_white(read_png(path)), path.stem) for path in _spread(files)]
     return f"<h2>Input: {len(files)} photographs</h2>{_row(pictures)}"
 
 
 def _geometry(geometry: Path) -> str:
     normals = sorted((geometry / "normals").glob("*.png"))
-    pictures = [(_on_white(read_png(path)), f"normals {path.stem}") for path in _spread(normals)]
+    pictures = [(on_white(read_png(path)), f"normals {path.stem}") for path in _spread(normals)]
     return f"<h2>Geometry</h2>{_row(pictures)}"
 
 
@@ -95,7 +96,7 @@ def _light(name: str, artefacts: dict[str, Path], capture: Path) -> str:
             f"<h3>Relit</h3><video controls loop muted autoplay src='data:video/mp4;base64,{encoded}'></video>"
         )
     frames = sorted((artefacts["turntable"] / "images").glob("*.png"))
-    parts.append(_row([(_on_white(read_png(path)), f"view {path.stem}") for path in _spread(frames)]))
+    parts.append(_row([(on_white(read_png(path)), f"view {path.stem}") for path in _spread(frames)]))
     cue_files = sorted((artefacts["cues"] / "cues").glob("*.exr"))
     if cue_files:
         parts.append(f"<h3>Radiance cues of photograph {cue_files[0].stem}</h3>{_row(_cue_pictures(cue_files[0]))}")
@@ -120,7 +121,7 @@ def _samples(relit: Path, capture: Path) -> str:
     for view in views[:: max(1, len(views) // 2)][:2]:
         photograph = read_png(capture / "images" / f"{view}.png")
         alpha = photograph[..., 3]
-        row = [(_on_white(photograph), f"photograph {view}")]
+        row = [(on_white(photograph), f"photograph {view}")]
         for path in [file for file in files if file.stem.startswith(f"{view}_")][: _MAX_PICTURES - 1]:
             row.append((read_png(path)[..., :3] + (1 - alpha[..., None]), f"sample {path.stem.rsplit('_', 1)[1]}"))
         parts.append(_row(row))
@@ -162,10 +163,6 @@ def _exposure(linear_rgb: np.ndarray) -> float:
 def _spread(files: Sequence[Path]) -> list[Path]:
     count = min(len(files), _MAX_PICTURES)
     return [files[int(i)] for i in np.linspace(0, len(files) - 1, count)] if files else []
-
-
-def _on_white(rgba: np.ndarray) -> np.ndarray:
-    return composite(rgba[..., :3], rgba[..., 3], 1.0) if rgba.shape[-1] == 4 else rgba
 
 
 def _row(pictures: list[tuple[np.ndarray, str]]) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from illuminerf.cues.renderer import CUE_CHANNELS
 from illuminerf.data.capture import load_capture
 from illuminerf.diffusion.full_size import Photograph, relight_photographs, straight_cues
 from illuminerf.diffusion.pretrained import model_folder
@@ -24,7 +25,6 @@ from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import step_progress
 
 STAGE = "relight_views"
-_CUE_NAMES = tuple(f"{lobe}.{c}" for lobe in ("diffuse", "ggx_005", "ggx_013", "ggx_034") for c in "RGB")
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def _relight(
 def _photograph(views: Views, view: int, cues: Path, device: torch.device) -> Photograph:
     path = Path(cues) / "cues" / f"{view:03d}.exr"
     channels = read_exr(path)
-    missing = [name for name in (*_CUE_NAMES, "A") if name not in channels]
+    missing = [name for name in (*CUE_CHANNELS, "A") if name not in channels]
     if missing:
         raise UserError(f"{path} lacks the channel '{missing[0]}'", fix="render the radiance cues again")
     alpha = views.alpha[view]
@@ -131,7 +131,7 @@ def _photograph(views: Views, view: int, cues: Path, device: torch.device) -> Ph
             wanted=str(alpha.shape),
             fix="render the radiance cues from this capture",
         )
-    straight = straight_cues(np.stack([channels[name] for name in _CUE_NAMES]), channels["A"])
+    straight = straight_cues(np.stack([channels[name] for name in CUE_CHANNELS]), channels["A"])
     masked = np.concatenate([views.srgb[view] * alpha[..., None], alpha[..., None]], -1)
     return Photograph(
         torch.from_numpy(np.ascontiguousarray(masked.transpose(2, 0, 1))).float().to(device),
