@@ -14,15 +14,13 @@ and JSON metadata: object, view, split, lights (name, rotation_radians, is_flipp
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
-from illuminerf.cues.gltf_objects import Parts, load_object, varied
-from illuminerf.cues.renderer import CueSampling, MitsubaCueRenderer
-from illuminerf.cues.shading import ShadedScene, concatenated
-from illuminerf.cues.texture_baking import baked
+from illuminerf.cues.gltf_objects import load_object, varied
+from illuminerf.cues.item_renderer import MitsubaItemRenderer, RenderedItem
+from illuminerf.cues.renderer import CueSampling
 from illuminerf.cues.training_lights import draw_light
 from illuminerf.scene.cameras import Cameras, sphere_cameras
 from illuminerf.scene.environment import EnvironmentMap
@@ -180,7 +178,9 @@ def _render_item(path: Path, view: int, maps: list[EnvironmentMap], config: Conf
     chosen = generator.choice(len(maps), config.num_lights, replace=False)
     draws = [draw_light(maps[index], generator, config.flip_probability) for index in chosen]
     seed = derived_seed(config.seed, "render", path.stem, view)
-    tensors, coverage = _rendered(parts, camera, [light for light, _ in draws], config, seed)
+    renderer = MitsubaItemRenderer(config.samples_per_pixel, config.cue_sampling, config.bakes_textures)
+    rendered = renderer.render(parts, camera, [light for light, _ in draws], seed)
+    coverage = float(rendered.alpha.mean())
     if coverage == 0:
         return "nothing to be seen in a view"
     metadata = {
@@ -191,38 +191,20 @@ def _render_item(path: Path, view: int, maps: list[EnvironmentMap], config: Conf
         "camera": camera.to_dict(),
         "coverage": coverage,
     }
-    save_checkpoint(item, tensors, metadata)
+    save_checkpoint(item, _tensors(rendered), metadata)
     return None
 
 
-def _rendered(
-    parts: Parts, camera: Cameras, lights: list[EnvironmentMap], config: Config, seed: int
-) -> tuple[dict[str, Any], float]:
-    scene = ShadedScene(baked(parts) if config.bakes_textures else parts, lights[0], config.cue_sampling.device)
-    tracer = MitsubaCueRenderer(concatenated([mesh for mesh, _ in parts]), lights[0], config.cue_sampling)
-    targets, cues = [], []
-    alpha = np.zeros(0, np.float32)
-    for index, light in enumerate(lights):
-        image = scene.render(camera, 0, light, config.samples_per_pixel, derived_seed(seed, "target", index))
-        targets.append(image[..., :3].transpose(2, 0, 1))
-        cues.append(tracer.render(camera, 0, light, derived_seed(seed, "cues", index))[:12])
-        alpha = np.clip(image[..., 3], 0, 1) if index == 0 else alpha
-    surface = scene.properties(camera, 0)
-    albedo = srgb_from_linear(np.clip(surface["base_color"] / _at_least(surface["coverage"])[..., None], 0, 1))
-    tensors = {
-        "targets": _half(np.stack(targets)),
-        "cues": _half(np.stack(cues)),
-        "alpha": _byte(alpha),
-        "albedo": _byte(albedo.transpose(2, 0, 1)),
-        "roughness": _byte(surface["roughness"] / _at_least(surface["coverage"])),
-        "metallic": _byte(surface["metallic"] / _at_least(surface["coverage"])),
-        "normal": _half(surface["normal"].transpose(2, 0, 1)),
+def _tensors(item: RenderedItem) -> dict[str, torch.Tensor]:
+    return {
+        "targets": _half(item.targets),
+        "cues": _half(item.cues),
+        "alpha": _byte(item.alpha),
+        "albedo": _byte(srgb_from_linear(item.base_color)),
+        "roughness": _byte(item.roughness),
+        "metallic": _byte(item.metallic),
+        "normal": _half(item.normal),
     }
-    return tensors, float(alpha.mean())
-
-
-def _at_least(coverage: np.ndarray) -> np.ndarray:
-    return np.maximum(coverage, 1e-3)
 
 
 def _half(array: np.ndarray) -> torch.Tensor:
