@@ -1,5 +1,6 @@
 """The command line: one subcommand per stage, plus `relight` and `demo` that run them all."""
 
+import os
 import sys
 import warnings
 from collections.abc import Callable
@@ -25,8 +26,11 @@ from illuminerf.stages import (
 )
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import console, say
+from illuminerf.workflow.task_pool import Execution
 
 PositionalPath = Annotated[Path, tyro.conf.Positional]
+_DEFAULT_PAIRS = render_training_pairs.Config()
+_ALL_CORES = Execution(workers=os.cpu_count() or 1)
 
 
 def relight_command(
@@ -82,6 +86,26 @@ def presets_command() -> None:
     """List the presets: what each is for and what it costs."""
     for preset in PRESETS.values():
         say(f"[bold]{preset.name}[/bold]: {preset.description}")
+
+
+def render_training_pairs_command(
+    objects: PositionalPath,
+    lights: PositionalPath,
+    out: str,
+    config: Annotated[render_training_pairs.Config, tyro.conf.arg(name="")] = _DEFAULT_PAIRS,
+    execution: Annotated[Execution, tyro.conf.arg(name="")] = _ALL_CORES,
+) -> None:
+    """Render objects under several lights, with cues: what a relighting model learns from.
+
+    Args:
+        objects: Folder of model files.
+        lights: Folder of .exr or .hdr environment maps.
+        out: Folder or fsspec URL; run the same command again to go on after an interruption.
+        config: What is rendered.
+        execution: Where.
+    """
+    render_training_pairs.run(objects, lights, config, out, execution)
+    say(f"done: {out}")
 
 
 class StageCall:
@@ -154,12 +178,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
         "Score rendered views against the truth by the TensoIR rule.",
         {"novel_views": Path, "truth": Path},
     ),
-    "render-training-pairs": _stage(
-        render_training_pairs.run,
-        render_training_pairs.Config,
-        "Render objects under several lights, with cues: what the relighting model learns from.",
-        {"objects": Path, "lights": Path},
-    ),
+    "render-training-pairs": render_training_pairs_command,
     "train-rdm": _stage(
         train_relighting_model.run,
         train_relighting_model.Config,

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save
 
 from illuminerf.diffusion.augmentation import (
     AugmentationConfig,
@@ -16,8 +17,10 @@ from illuminerf.diffusion.cue_coding import decode_cues
 from illuminerf.diffusion.relighting_scores import held_out_pairs, masked_psnr, masked_ssim, rescaled, true_composite
 from illuminerf.diffusion.training_items import diffuse_level, load_items
 from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
-from illuminerf.workflow.checkpoint import load_checkpoint, save_checkpoint
+from illuminerf.scene.relighting_pairs import iterate_items
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.shards import sample_tar, write_shard
+from illuminerf.workflow.storage import Storage
 from tests.diffusion.tiny import write_items
 
 EXACT = AugmentationConfig(composited_share=0.0)
@@ -73,9 +76,9 @@ def test_input_and_target_come_from_different_lights(folder: Path) -> None:
 def test_items_are_straight_and_averaged_exactly(folder: Path) -> None:
     item = load_items(folder, 32)[0]
     small = load_items(folder, 16)[0]
-    tensors, _ = load_checkpoint(folder / "items" / "disc0_0.safetensors")
-    torch.testing.assert_close((item.targets * item.alpha).float(), tensors["targets"].float(), atol=2e-3, rtol=0)
-    energy = torch.nn.functional.avg_pool2d(tensors["targets"].float(), 2)
+    targets = torch.from_numpy(next(iterate_items(folder))[1]["targets"]).float()
+    torch.testing.assert_close((item.targets * item.alpha).float(), targets, atol=2e-3, rtol=0)
+    energy = torch.nn.functional.avg_pool2d(targets, 2)
     torch.testing.assert_close((small.targets * small.alpha).float(), energy, atol=3e-3, rtol=0)
 
 
@@ -124,6 +127,7 @@ def test_bad_folders_are_user_errors(tmp_path: Path, folder: Path) -> None:
         load_items(tmp_path / "nothing", 32)
     with pytest.raises(UserError, match="multiple of 24"):
         load_items(folder, 24)
-    save_checkpoint(tmp_path / "odd" / "a.safetensors", {"targets": torch.zeros(4, 3, 8, 8)}, {})
+    sample = sample_tar("a_0", {"safetensors": save({"targets": torch.zeros(4, 3, 8, 8)}), "json": b"{}"})
+    write_shard(Storage(tmp_path / "odd"), "pairs-000000", [sample], {})
     with pytest.raises(UserError, match="lacks"):
         load_items(tmp_path / "odd", 8)

@@ -2,12 +2,15 @@
 
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from illuminerf.diffusion.conditioning import ConditioningConfig, PyramidConfig, TextureConfig
 from illuminerf.diffusion.latents import PatchLatentConfig
 from illuminerf.diffusion.relighting_model import RelightingModel, RelightingModelConfig, UNetConfig
-from illuminerf.workflow.checkpoint import save_checkpoint
+from illuminerf.scene.relighting_pairs import encode_item
+from illuminerf.workflow.shards import sample_tar, write_shard
+from illuminerf.workflow.storage import Storage
 
 TINY = RelightingModelConfig(
     image_size=32,
@@ -41,22 +44,27 @@ def random_condition_inputs(batch: int, size: int, seed: int = 2) -> tuple[torch
 
 
 def write_items(folder: Path, count: int = 3, size: int = 32) -> Path:
-    """Lambertian discs with a little gloss, as the renderer writes items."""
+    """Lambertian discs with a little gloss, in one shard as the renderer writes it."""
     generator = torch.Generator().manual_seed(0)
     axis = torch.linspace(-1, 1, size)
     alpha = (axis[:, None] ** 2 + axis**2 < 0.7).float()
+    plane = np.ones((size, size), np.float32)
+    samples = []
     for index in range(count):
         across, down = torch.rand(2, 4, 12, 1, 1, generator=generator) * 1.2 - 0.6
         brightness = 0.2 + torch.rand(4, 12, 1, 1, generator=generator)
         cues = brightness * (1.3 + across * axis + down * axis[:, None]) * alpha
-        albedo = 0.1 + 0.8 * torch.rand(3, 1, 1, generator=generator).expand(3, size, size)
-        tensors = {
-            "targets": (cues[:, :3] * albedo + 0.04 * cues[:, 9:]).half(),
-            "cues": cues.half(),
-            "alpha": (alpha * 255).to(torch.uint8),
-            "albedo": (albedo ** (1 / 2.2) * 255).to(torch.uint8),
-            "roughness": torch.full((size, size), 87, dtype=torch.uint8),
-            "metallic": torch.zeros(size, size, dtype=torch.uint8),
-        }
-        save_checkpoint(folder / "items" / f"disc{index}_0.safetensors", tensors, {})
+        albedo = (0.1 + 0.8 * torch.rand(3, 1, 1, generator=generator)).expand(3, size, size)
+        files = encode_item(
+            targets=(cues[:, :3] * albedo + 0.04 * cues[:, 9:]).numpy(),
+            cues=cues.numpy(),
+            alpha=alpha.numpy(),
+            base_color=albedo.numpy(),
+            roughness=0.34 * plane,
+            metallic=0 * plane,
+            normal=np.stack([0 * plane, 0 * plane, plane]),
+            metadata={},
+        )
+        samples.append(sample_tar(f"disc{index}_0", files))
+    write_shard(Storage(folder), "pairs-000000", samples, {})
     return folder

@@ -1,37 +1,47 @@
-"""Training pairs: the items' form, their determinism, resuming, and broken objects by name."""
+"""Training pairs: the items' form, their determinism, resuming, damage, and broken objects by name."""
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import trimesh
+from trimesh.visual.material import PBRMaterial
 
+from illuminerf.cues import training_shards
+from illuminerf.cues.object_views import ViewSettings
 from illuminerf.cues.renderer import CueSampling
+from illuminerf.cues.variations import MaterialVariation
+from illuminerf.diffusion.training_items import load_items
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.environment import EnvironmentMap
+from illuminerf.scene.relighting_pairs import iterate_items
 from illuminerf.stages import render_training_pairs
 from illuminerf.stages.render_training_pairs import Config
-from illuminerf.workflow.artefact import fingerprint
 from illuminerf.workflow.atomic import read_json
-from illuminerf.workflow.checkpoint import load_checkpoint
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.task_pool import Execution
 
-CONFIG = Config(num_views=1, num_lights=2, size=24, samples_per_pixel=4, cue_sampling=CueSampling(4))
+VIEWS = ViewSettings(
+    num_views=2, num_lights=2, size=24, samples_per_pixel=4, cue_sampling=CueSampling(4), light_height=8
+)
+CONFIG = Config(VIEWS, objects_per_shard=2)
 
 
-@pytest.fixture
-def assets(tmp_path: Path) -> tuple[Path, Path]:
-    models, lights = tmp_path / "models", tmp_path / "lights"
+def write_object(folder: Path, name: str, mesh: trimesh.Trimesh, **material: Any) -> None:
+    values = {"baseColorFactor": [0.8, 0.3, 0.1, 1.0], "roughnessFactor": 0.6} | material
+    mesh.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(**values))
+    content = trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=True)
+    (folder / f"{name}.glb").write_bytes(content)
+
+
+def write_assets(folder: Path) -> tuple[Path, Path]:
+    models, lights = folder / "models", folder / "lights"
     models.mkdir()
-    for name, mesh in (("ball", trimesh.creation.icosphere(2)), ("cube", trimesh.creation.box())):
-        mesh.visual = trimesh.visual.TextureVisuals(
-            material=trimesh.visual.material.PBRMaterial(baseColorFactor=[0.8, 0.3, 0.1, 1.0], roughnessFactor=0.6)
-        )
-        (models / f"{name}.glb").write_bytes(
-            trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=True)
-        )
+    write_object(models, "ball", trimesh.creation.icosphere(2))
+    write_object(models, "cube", trimesh.creation.box())
+    write_object(models, "cone", trimesh.creation.cone(1.0, 2.0))
     (models / "broken.glb").write_bytes(b"nothing")
     generator = np.random.default_rng(0)
     for name in ("noon", "dusk", "night"):
@@ -39,87 +49,169 @@ def assets(tmp_path: Path) -> tuple[Path, Path]:
     return models, lights
 
 
+@pytest.fixture
+def assets(tmp_path: Path) -> tuple[Path, Path]:
+    return write_assets(tmp_path)
+
+
+def shards(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(out.glob("pairs-*"))}
+
+
 def test_items_hold_what_training_needs(assets: tuple[Path, Path], tmp_path: Path) -> None:
-    out = render_training_pairs.run(*assets, CONFIG, tmp_path / "pairs")
+    config = replace(CONFIG, views=replace(VIEWS, materials=MaterialVariation.none()))
+    out = tmp_path / "pairs"
+    render_training_pairs.run(*assets, config, out)
     manifest = read_json(out / "manifest.json")
-    assert manifest["items"] == ["ball_0", "cube_0"]
-    assert list(manifest["quarantined"]) == ["broken"] and "unreadable" in manifest["quarantined"]["broken"]
-    tensors, metadata = load_checkpoint(out / "items" / "ball_0.safetensors")
-    shapes = {name: (tuple(tensor.shape), tensor.dtype) for name, tensor in tensors.items()}
+    assert manifest["num_items"] == 6 and manifest["num_ordered_pairs"] == 12
+    assert list(manifest["left_out"]) == ["broken_0", "broken_1"] and sum(manifest["left_out_by_reason"].values()) == 2
+    assert "broken.glb" in manifest["left_out"]["broken_0"]["message"]
+    assert sorted(path.name for path in out.iterdir() if path.suffix == ".tar") == list(
+        map("{}.tar".format, manifest["shards"])
+    )
+    assert not (out / "staging").exists()
+    items = {key: (arrays, metadata) for key, arrays, metadata in iterate_items(out)}
+    assert sorted(items) == ["ball_0", "ball_1", "cone_0", "cone_1", "cube_0", "cube_1"]
+    arrays, metadata = items["ball_0"]
+    shapes = {name: (array.shape, array.dtype.name) for name, array in arrays.items()}
     assert shapes == {
-        "targets": ((2, 3, 24, 24), torch.float16),
-        "cues": ((2, 12, 24, 24), torch.float16),
-        "alpha": ((24, 24), torch.uint8),
-        "albedo": ((3, 24, 24), torch.uint8),
-        "roughness": ((24, 24), torch.uint8),
-        "metallic": ((24, 24), torch.uint8),
-        "normal": ((3, 24, 24), torch.float16),
+        "targets": ((2, 3, 24, 24), "float16"),
+        "cues": ((2, 12, 24, 24), "float16"),
+        "alpha": ((24, 24), "uint8"),
+        "albedo": ((3, 24, 24), "uint8"),
+        "roughness": ((24, 24), "uint8"),
+        "metallic": ((24, 24), "uint8"),
+        "normal": ((3, 24, 24), "float16"),
     }
-    assert metadata["object"] == "ball" and metadata["split"] == "train" and len(metadata["lights"]) == 2
-    assert metadata["lights"][0]["name"] != metadata["lights"][1]["name"]
-    camera = Cameras.from_dict(metadata["camera"])
-    _, directions = camera.image_rays(0)
-    normal = tensors["normal"].float().permute(1, 2, 0)
-    assert (normal * directions).sum(-1).max() <= 1e-2
-    inside = tensors["alpha"] == 255
-    assert 0.4 < inside.float().mean() < 0.9
-    assert (tensors["targets"][:, :, tensors["alpha"] == 0].abs().amax()) < 0.2  # edge pixels of another seed only
+    assert metadata["object"] == "ball" and metadata["split"] == "train" and metadata["variations"] == []
+    assert metadata["lights"][0]["name"] != metadata["lights"][1]["name"] and len(metadata["object_sha256"]) == 64
+    _, directions = Cameras.from_dict(metadata["camera"]).image_rays(0)
+    assert (arrays["normal"].astype(np.float32).transpose(1, 2, 0) * directions.numpy()).sum(-1).max() <= 1e-2
+    assert 0.4 < (arrays["alpha"] == 255).mean() < 0.9
+    assert len(load_items(out, 24)) == 6
 
 
 def test_a_diffuse_object_is_albedo_times_its_cue(assets: tuple[Path, Path], tmp_path: Path) -> None:
     """Targets and cues are made separately, so agreement holds axes, light and exposure together."""
-    config = replace(CONFIG, vary_probability=0.0, samples_per_pixel=64, cue_sampling=CueSampling(64))
-    (assets[0] / "cube.glb").unlink()
-    mesh = trimesh.creation.icosphere(3)
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorFactor=[0.8, 0.3, 0.1, 1.0], roughnessFactor=1.0, metallicFactor=0.0
-    )
-    mesh.visual = trimesh.visual.TextureVisuals(material=material)
-    (assets[0] / "ball.glb").write_bytes(trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=True))
-    out = render_training_pairs.run(*assets, config, tmp_path / "pairs")
-    tensors, _ = load_checkpoint(out / "items" / "ball_0.safetensors")
-    inside = tensors["alpha"] == 255
-    targets, cues = tensors["targets"].float()[:, 0][:, inside], tensors["cues"].float()[:, 0][:, inside]
+    views = replace(VIEWS, num_views=1, samples_per_pixel=64, cue_sampling=CueSampling(64))
+    config = Config(replace(views, materials=MaterialVariation.none()), excluded=("cube", "cone", "broken"))
+    write_object(assets[0], "ball", trimesh.creation.icosphere(3), roughnessFactor=1.0, metallicFactor=0.0)
+    render_training_pairs.run(*assets, config, tmp_path / "pairs")
+    ((_, arrays, _),) = iterate_items(tmp_path / "pairs")
+    inside = arrays["alpha"] == 255
+    targets, cues = (arrays[name].astype(np.float32)[:, 0][:, inside] for name in ("targets", "cues"))
     ratio = targets / cues
-    assert abs(ratio.median() - 0.8) < 0.08
-    assert ratio.std() < 0.12
-    swapped = targets / cues.flip(0)
-    assert (swapped - 0.8).abs().mean() > (ratio - 0.8).abs().mean()
+    assert abs(np.median(ratio) - 0.8) < 0.08 and ratio.std() < 0.12
+    assert np.abs(targets / cues[::-1] - 0.8).mean() > np.abs(ratio - 0.8).mean()
+    assert read_json(tmp_path / "pairs" / "manifest.json")["excluded"] == ["broken", "cone", "cube"]
 
 
-def test_resumed_equals_uninterrupted(assets: tuple[Path, Path], tmp_path: Path) -> None:
-    whole = render_training_pairs.run(*assets, CONFIG, tmp_path / "whole")
-    broken = render_training_pairs.run(*assets, CONFIG, tmp_path / "broken")
-    (broken / "DONE").unlink()
-    (broken / "items" / "cube_0.safetensors").unlink()
-    render_training_pairs.run(*assets, CONFIG, broken)
-    assert fingerprint(whole) == fingerprint(broken)
-    other = render_training_pairs.run(*assets, replace(CONFIG, seed=1), tmp_path / "other")
-    assert fingerprint(other) != fingerprint(whole)
+def test_however_it_is_made_the_bytes_are_the_same(assets: tuple[Path, Path], tmp_path: Path) -> None:
+    render_training_pairs.run(*assets, CONFIG, tmp_path / "here")
+    render_training_pairs.run(*assets, CONFIG, tmp_path / "spread", Execution(workers=2))
+    render_training_pairs.run(*assets, CONFIG, f"file://{tmp_path}/url")
+    assert shards(tmp_path / "here") == shards(tmp_path / "spread") == shards(tmp_path / "url")
+    assert len(shards(tmp_path / "here")) == 4
+    other = replace(CONFIG, views=replace(VIEWS, seed=1))
+    render_training_pairs.run(*assets, other, tmp_path / "other")
+    assert shards(tmp_path / "other") != shards(tmp_path / "here")
 
 
-def test_excluded_objects_are_named(assets: tuple[Path, Path], tmp_path: Path) -> None:
-    out = render_training_pairs.run(*assets, replace(CONFIG, excluded=("cube",)), tmp_path / "pairs")
-    manifest = read_json(out / "manifest.json")
-    assert manifest["items"] == ["ball_0"]
-    assert manifest["quarantined"]["cube"] == "excluded by name"
+class StoppedError(Exception):
+    """Stands in for a power cut."""
 
 
-def test_the_object_fills_the_picture() -> None:
-    thin = np.array([[0, 0, 1.0], [0, 0, -1.0], [0.1, 0, 0]])
-    for seed in range(10):
-        camera = render_training_pairs.item_camera(Config(size=64), thin, np.random.default_rng(seed))
-        points, depth = camera.project(thin)
-        reach = np.abs(points[0] / 32 - 1).max()
-        assert (depth > 0).all() and reach == pytest.approx(1 / Config().margin, abs=1e-6)
+def test_interrupted_and_resumed_equals_uninterrupted(
+    assets: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    render_training_pairs.run(*assets, CONFIG, tmp_path / "whole")
+    out = tmp_path / "stopped"
+    real = training_shards.render_views
+    for _ in range(3):  # one more item each time
+        made: list[int] = []
+
+        def stopping(*arguments: Any, made: list[int] = made) -> Any:
+            for view, files in real(*arguments):
+                if made:
+                    raise StoppedError
+                made.append(view)
+                yield view, files
+
+        monkeypatch.setattr(training_shards, "render_views", stopping)
+        with pytest.raises(StoppedError):
+            render_training_pairs.run(*assets, CONFIG, out)
+        monkeypatch.setattr(training_shards, "render_views", real)
+        assert not (out / "DONE").exists()
+    render_training_pairs.run(*assets, CONFIG, out)
+    assert shards(out) == shards(tmp_path / "whole") and not (out / "staging").exists()
+    assert (out / "DONE").read_bytes() == (tmp_path / "whole" / "DONE").read_bytes()
+
+
+def test_finished_shards_stay_and_damaged_ones_are_made_again(assets: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "pairs"
+    render_training_pairs.run(*assets, CONFIG, out)
+    before = shards(out)
+    times = {path: path.stat().st_mtime_ns for path in out.glob("pairs-*.tar")}
+    render_training_pairs.run(*assets, CONFIG, out)
+    assert {path: path.stat().st_mtime_ns for path in times} == times
+    damaged, kept = sorted(times)
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 2] ^= 1
+    damaged.write_bytes(content)
+    with pytest.raises(UserError, match="damaged"):
+        list(iterate_items(out))
+    render_training_pairs.run(*assets, CONFIG, out)
+    assert shards(out) == before and kept.stat().st_mtime_ns == times[kept]
+
+
+def test_a_damaged_staged_item_is_made_again(
+    assets: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    render_training_pairs.run(*assets, CONFIG, tmp_path / "whole")
+    out, real = tmp_path / "pairs", render_training_pairs.pack_shard
+
+    def spoil_then_pack(task: Any) -> Any:
+        staged = sorted((out / "staging" / task.shard).glob("*.item"))[0]
+        content = bytearray(staged.read_bytes())
+        content[-700] ^= 255
+        staged.write_bytes(content)
+        monkeypatch.setattr(render_training_pairs, "pack_shard", real)
+        return real(task)
+
+    monkeypatch.setattr(render_training_pairs, "pack_shard", spoil_then_pack)
+    render_training_pairs.run(*assets, CONFIG, out)
+    assert shards(out) == shards(tmp_path / "whole")
+
+
+def test_unusable_lights_are_left_out_by_name(assets: tuple[Path, Path], tmp_path: Path) -> None:
+    from illuminerf.scene.images import write_exr
+
+    for name, image in (("tiny", np.ones((1, 1), np.float32)), ("hole", np.full((8, 16), np.nan, np.float32))):
+        write_exr(assets[1] / f"{name}.exr", dict.fromkeys("RGB", image))
+    config = replace(CONFIG, excluded=("broken", "cone", "cube"))
+    render_training_pairs.run(*assets, config, tmp_path / "pairs")
+    manifest = read_json(tmp_path / "pairs" / "manifest.json")
+    assert sorted(manifest["lights_left_out"]) == ["hole", "tiny"] and manifest["lights"] == ["dusk", "night", "noon"]
 
 
 def test_wrong_inputs_are_explained(assets: tuple[Path, Path], tmp_path: Path) -> None:
+    run = render_training_pairs.run
     with pytest.raises(UserError, match="no objects"):
-        render_training_pairs.run(assets[1], assets[1], CONFIG, tmp_path / "a")
+        run(assets[1], assets[1], CONFIG, tmp_path / "a")
     with pytest.raises(UserError, match="too few lights"):
-        render_training_pairs.run(*assets, replace(CONFIG, num_lights=4), tmp_path / "b")
+        run(*assets, replace(CONFIG, views=replace(VIEWS, num_lights=4)), tmp_path / "b")
     with pytest.raises(UserError, match="two lights"):
-        Config(num_lights=1)
-    with pytest.raises(UserError, match="probabilities"):
-        Config(flip_probability=1.5)
+        ViewSettings(num_lights=1)
+    with pytest.raises(UserError, match="objects_per_shard"):
+        Config(objects_per_shard=0)
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "thesis.txt").write_text("mine")
+    with pytest.raises(UserError, match="not a run of this program"):
+        run(*assets, CONFIG, tmp_path / "c")
+    config = replace(CONFIG, excluded=("broken", "cone", "cube"))
+    run(*assets, config, tmp_path / "d")
+    with pytest.raises(UserError, match="views.seed is 0 there and 3 here"):
+        run(*assets, replace(config, views=replace(VIEWS, seed=3)), tmp_path / "d")
+    write_object(assets[0], "newcomer", trimesh.creation.box())
+    with pytest.raises(UserError, match="input 'objects' has changed"):
+        run(*assets, config, tmp_path / "d")

@@ -4,7 +4,7 @@
 """
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -39,6 +39,7 @@ class RenderedItem:
     normal: np.ndarray
 
 
+@runtime_checkable
 class ItemRenderer(Protocol):
     """A path tracer for training items. The same arguments give the same arrays."""
 

@@ -88,6 +88,9 @@ def load_mitsuba(device: str = "auto") -> ModuleType:
         raise UserError(
             f"Mitsuba's {variant} does not start", got=str(error).splitlines()[0], fix="render with --device cpu"
         ) from error
+    threads = os.environ.get("ILLUMINERF_RENDER_THREADS", "")
+    if threads.isdigit() and int(threads) > 0:  # several processes on one machine share its cores
+        importlib.import_module("drjit").set_thread_count(int(threads))
     mitsuba.set_log_level(mitsuba.LogLevel.Error)  # it warns of every rounding of a sample count
     _chosen.append(variant)
     return mitsuba

@@ -1,19 +1,19 @@
 """Rendered training items: one object from one camera under a few lights, with its cues and G-buffer.
 
-One safetensors file per item: `targets` [lights, 3, h, w] and `cues` [lights, 12, h, w], linear and premultiplied,
-float16; `alpha` [h, w], `albedo` [3, h, w] (sRGB-coded base colour), `roughness`, `metallic` [h, w], uint8.
+They are read from the shards that `render_training_pairs` writes (see `scene.relighting_pairs`).
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
 from illuminerf.scene.images import linear_from_srgb
-from illuminerf.workflow.checkpoint import load_checkpoint
+from illuminerf.scene.relighting_pairs import iterate_items
 from illuminerf.workflow.errors import UserError
 
 _SMALLEST_COVERAGE = 0.02
@@ -33,31 +33,25 @@ class TrainingItem:
     metallic: Float[Tensor, "1 height width"]
 
 
-def load_items(folder: Path, size: int) -> list[TrainingItem]:
-    """Read every item under `folder` (or its `items/`), area-averaged to `size` pixels, sorted by name.
+def load_items(folder: str | Path, size: int) -> list[TrainingItem]:
+    """Read every item in the finished shards of `folder` (or an fsspec URL), area-averaged to `size` pixels, by name.
 
     Items with almost no covered pixels or without light are left out.
 
     Raises:
-        UserError: there is no item, or one is corrupt or larger than `size` by no whole factor.
+        UserError: there is no item, or one is damaged or larger than `size` by no whole factor.
     """
-    folder = Path(folder)
-    folder = folder / "items" if (folder / "items").is_dir() else folder
-    paths = sorted(folder.glob("*.safetensors"))
-    if not paths:
-        raise UserError(f"{folder} holds no training items", wanted="*.safetensors", fix="render pairs first")
-    items = [_loaded(path, size) for path in paths]
-    return [item for item in items if _is_usable(item)]
+    items = [_averaged(key, arrays, size) for key, arrays, _ in iterate_items(folder)]
+    if not items:
+        raise UserError(f"{folder} holds no training items", wanted="pairs-000000.tar, ...", fix="render pairs first")
+    return sorted((item for item in items if _is_usable(item)), key=lambda item: item.name)
 
 
-def _loaded(path: Path, size: int) -> TrainingItem:
-    tensors, _ = load_checkpoint(path)
-    missing = sorted({"targets", "cues", "alpha", "albedo", "roughness", "metallic"} - set(tensors))
-    if missing:
-        raise UserError(f"{path} lacks '{missing[0]}'", fix="render it again")
+def _averaged(name: str, arrays: dict[str, np.ndarray], size: int) -> TrainingItem:
+    tensors = {field: torch.from_numpy(values) for field, values in arrays.items()}
     height = tensors["targets"].shape[-1]
     if height % size:
-        raise UserError(f"{path} is {height} pixels wide", wanted=f"a multiple of {size}")
+        raise UserError(f"{name} is {height} pixels wide", wanted=f"a multiple of {size}")
     factor = height // size
 
     def averaged(values: Tensor) -> Tensor:
@@ -75,7 +69,7 @@ def _loaded(path: Path, size: int) -> TrainingItem:
 
     albedo = linear_from_srgb(surface("albedo").float()).half()
     return TrainingItem(
-        path.stem, radiance("targets"), radiance("cues"), alpha[0].half(), albedo, surface("roughness"),
+        name, radiance("targets"), radiance("cues"), alpha[0].half(), albedo, surface("roughness"),
         surface("metallic"),
     )  # fmt: skip
 

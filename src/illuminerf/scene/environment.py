@@ -112,19 +112,13 @@ class EnvironmentMap:
         return replace(self, linear_rgb=np.ascontiguousarray(self.linear_rgb[:, ::-1]))
 
     def resized(self, height: int) -> "EnvironmentMap":
-        """Average over areas, so that small lamps keep their energy.
-
-        Raises:
-            UserError: the new height does not divide the old one.
-        """
+        """Average over areas, to more or fewer rows, so that small lamps keep their energy."""
         old = self.linear_rgb.shape[0]
-        if height >= old:
+        if height == old:
             return self
-        if old % height:
-            raise UserError("the light's height cannot be averaged down evenly", got=f"{old} to {height}")
-        factor = old // height
-        blocks = self.linear_rgb.reshape(height, factor, 2 * height, factor, 3)
-        return replace(self, linear_rgb=blocks.mean((1, 3), dtype=np.float64).astype(np.float32))
+        rows, columns = _area_shares(old, height), _area_shares(2 * old, 2 * height)
+        small = np.einsum("hH,HWc->hWc", rows, self.linear_rgb.astype(np.float64), optimize=True)
+        return replace(self, linear_rgb=np.einsum("wW,hWc->hwc", columns, small, optimize=True).astype(np.float32))
 
     def directions(self) -> np.ndarray:
         """Unit directions of the pixel centres, float32 [height, width, 3]."""
@@ -170,3 +164,11 @@ def chrome_ball(light: EnvironmentMap, size: int) -> tuple[np.ndarray, np.ndarra
     normal = np.stack([toward, right, up], -1)  # the camera looks along -x, so +y is to its right
     reflected = 2 * normal[..., :1] * normal - np.array([1.0, 0.0, 0.0])
     return light.radiance(reflected) * inside[..., None], inside.astype(np.float32)
+
+
+def _area_shares(old: int, new: int) -> np.ndarray:
+    """How much of each of `new` cells each of `old` cells makes up: [new, old], rows sum to 1."""
+    edges = np.arange(new + 1) * old / new
+    shares = np.minimum(edges[1:, None], np.arange(1, old + 1)) - np.maximum(edges[:-1, None], np.arange(old))
+    shares = np.clip(shares, 0, None)
+    return shares / shares.sum(1, keepdims=True)

@@ -32,7 +32,7 @@ class Config:
     exposure_stops: float = 0.0
     """The light's radiance times 2^stops."""
     max_light_height: int = 512
-    """Rows; larger lights are averaged down by a whole factor, so that small lamps keep their energy."""
+    """Rows; larger lights are averaged down, so that small lamps keep their energy."""
     seed: int = 0
     """Each view's seed is derived from it."""
 
@@ -97,8 +97,5 @@ def cue_path(cues: Path, view: int) -> Path:
 def placed_light(light: Path, config: Config) -> EnvironmentMap:
     """The light of a file, averaged down if large, turned and exposed."""
     loaded = EnvironmentMap.load(light)
-    height = loaded.linear_rgb.shape[0]
-    divisor = next(d for d in range(1, height + 1) if height % d == 0 and height // d <= config.max_light_height)
-    if divisor > 1:
-        loaded = loaded.resized(height // divisor)
+    loaded = loaded.resized(min(loaded.linear_rgb.shape[0], config.max_light_height))
     return loaded.rotated(config.light_rotation_radians).exposed(config.exposure_stops)

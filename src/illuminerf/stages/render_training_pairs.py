@@ -1,215 +1,257 @@
 """Objects x views x lights -> the pairs a relighting model learns from (paper, 3.3 and supplement).
 
-One file per view holds the object under several lights with the radiance cues of each: from k lights come k * (k - 1)
-ordered pairs. Files are `items/<object>_<view>.safetensors`:
-    targets    float16 [lights, 3, height, width]   linear, premultiplied
-    cues       float16 [lights, 12, height, width]  linear, premultiplied, channels as `CUE_CHANNELS`
-    alpha      uint8 [height, width]
-    albedo     uint8 [3, height, width]             base colour, sRGB coded, straight
-    roughness, metallic  uint8 [height, width]      times 255, straight
-    normal     float16 [3, height, width]           unit, world frame, towards the camera; 0 off the object
-and JSON metadata: object, view, split, lights (name, rotation_radians, is_flipped, scale), camera, coverage.
+`out` is a folder or any fsspec URL. It comes to hold
+    pairs-<000000>.tar, .json   WebDataset shards and their indices (see `scene.relighting_pairs`, `workflow.shards`)
+    manifest.json               shards, counts, licences, and what was left out with the reason
+    config.json, inputs.json, provenance.json, DONE
+Work is spread by object. A finished item waits in `staging/` until all items of its shard are there; then they become
+a shard, which is never written again. A killed run or worker therefore loses the items it was at and no more, and the
+same seed gives the same bytes however many processes or machines made them.
 """
 
-from collections.abc import Iterator
+import hashlib
+import json
+import time
+from collections import Counter
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-import torch
-
-from illuminerf.cues.gltf_objects import load_object, varied
-from illuminerf.cues.item_renderer import MitsubaItemRenderer, RenderedItem
-from illuminerf.cues.renderer import CueSampling
-from illuminerf.cues.training_lights import draw_light
-from illuminerf.scene.cameras import Cameras, sphere_cameras
-from illuminerf.scene.environment import EnvironmentMap
-from illuminerf.scene.images import srgb_from_linear
-from illuminerf.workflow.artefact import open_artefact
-from illuminerf.workflow.atomic import write_json
-from illuminerf.workflow.checkpoint import save_checkpoint
+from illuminerf.cues.light_library import light_paths, load_light
+from illuminerf.cues.object_views import ObjectFile, ViewSettings
+from illuminerf.cues.training_shards import (
+    ObjectTask,
+    PackTask,
+    Plan,
+    leave_out_missing,
+    pack_shard,
+    render_object,
+)
+from illuminerf.workflow.artefact import fingerprint, locked, provenance, refuse_other_key
 from illuminerf.workflow.config import to_json
-from illuminerf.workflow.device import derived_seed, numpy_generator
+from illuminerf.workflow.device import numpy_generator
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import say, step_progress
+from illuminerf.workflow.progress import StepProgress, say, step_progress
+from illuminerf.workflow.shards import LeftOut, ShardIndex, is_intact, read_index, remove_shard
+from illuminerf.workflow.storage import Storage
+from illuminerf.workflow.task_pool import Crash, Execution, TaskPool, open_pool
 
 STAGE = "render_training_pairs"
-_LIGHT_HEIGHT = 256
-_HALF_MAX = 65504.0
+SCHEMA = 2
 
 
 @dataclass(frozen=True)
 class Config:
-    """What is rendered, and how well."""
+    """What is rendered, and how it is stored."""
 
-    num_views: int = 4
-    """Cameras per object (paper: 4)."""
-    num_lights: int = 4
-    """Lights per view (paper's main text: 4)."""
-    size: int = 128
-    """Height and width in pixels (paper: 512)."""
-    samples_per_pixel: int = 16
-    """Paths per pixel of the targets. Deviation: 512 in the paper; the model averages what noise is left."""
-    cue_sampling: CueSampling = field(default_factory=lambda: CueSampling(samples_per_pixel=16))
-    """Paths and bounces of the cues."""
-    min_distance: float = 2.6
-    """Nearest camera, in radii of the object."""
-    max_distance: float = 3.8
-    """Farthest camera; the field of view follows, so that the object always fills the picture.
-    Deviation: the paper's focal length is 512 pixels at 512 x 512, whatever the distance."""
-    margin: float = 1.06
-    """Half the picture over the object's farthest point from its centre."""
-    min_elevation_radians: float = -0.4
-    """Lowest camera. Deviation: the paper takes the whole sphere; captures are seldom made from below."""
-    flip_probability: float = 0.5
-    """How often a light is turned upside down."""
-    vary_probability: float = 0.5
-    """How often an item's materials are replaced at random (see `gltf_objects.varied`).
-    Deviation: not in the paper, which has 150,000 objects where small collections have a hundred."""
-    bakes_textures: bool = True
-    """Move textures onto vertices, which saves compiling kernels; turn off above 128 pixels."""
+    views: ViewSettings = field(default_factory=ViewSettings)
+    """What is rendered of each object."""
+    objects_per_shard: int = 16
+    """Objects whose views share one shard."""
     excluded: tuple[str, ...] = ()
-    """Objects to leave out by name, for reasons seen by eye."""
-    split: str = "train"
-    """Written into each item's metadata."""
-    seed: int = 0
-    """Seed of every random choice, joined with the item's name."""
+    """Objects to leave out by id, for reasons seen by eye."""
 
     def __post_init__(self) -> None:
-        if min(self.num_views, self.size, self.samples_per_pixel) < 1 or self.num_lights < 2:
-            raise UserError("training pairs need at least one view, one sample and two lights")
-        if not 1 < self.min_distance <= self.max_distance:
-            raise UserError("camera distances must be over 1 and in order")
-        if not (0 <= self.flip_probability <= 1 and 0 <= self.vary_probability <= 1):
-            raise UserError("probabilities must lie in [0, 1]")
+        if self.objects_per_shard < 1:
+            raise UserError("objects_per_shard must be at least 1")
 
 
-def run(models: Path, lights: Path, config: Config, out: Path) -> Path:
-    """Render every view of every object in `models` under lights of `lights` into `out`; broken objects are named in
-    `manifest.json` with the reason, and never replaced by others.
+def run(objects: Path, lights: Path, config: Config, out: str | Path, execution: Execution | None = None) -> str | Path:
+    """Render every view of every object under random lights; broken objects are named in `manifest.json` with the
+    reason, and never replaced by others.
 
     Args:
-        models: a folder of .glb files.
+        objects: a folder of model files.
         lights: a folder of .exr or .hdr environment maps.
         config: the settings.
-        out: the artefact's folder.
+        out: a folder or an fsspec URL.
+        execution: processes or a Ray cluster; the result does not depend on it.
 
     Raises:
-        UserError: there are no objects, or too few lights.
+        UserError: there are no objects or too few lights, `out` was made with other settings, or it cannot be written.
     """
-    objects = sorted(models.glob("*.glb"))
-    if not objects:
-        raise UserError(f"{models} holds no objects", wanted=".glb files")
-    maps = _load_lights(lights, config.num_lights)
-    with open_artefact(out, STAGE, config, {"models": models, "lights": lights}) as artefact:
-        if artefact.is_done:
-            return out
-        quarantined = {name: "excluded by name" for name in config.excluded}
-        total = len(objects) * config.num_views
-        with step_progress("render training pairs", total) as progress:
-            # every object once before any object twice, so that training may start on a part
-            for path, view in _in_rounds(objects, config.num_views):
-                item = out / "items" / f"{path.stem}_{view}.safetensors"
-                if path.stem not in quarantined and not item.exists():
-                    reason = _render_item(path, view, maps, config, item)
-                    if reason:
-                        quarantined[path.stem] = reason
-                        say(f"quarantined {path.stem}: {reason}")
-                progress.advance(quarantined=float(len(quarantined)))
-        items = sorted(item.stem for item in (out / "items").glob("*.safetensors"))
-        write_json(out / "manifest.json", {"items": items, "quarantined": dict(sorted(quarantined.items()))})
-        artefact.finish({"num_items": len(items), "num_quarantined": len(quarantined)})
+    execution = execution or Execution()
+    storage = Storage(out)
+    collection = _objects(objects)
+    usable, unusable_lights = _usable_lights(lights, config.views)
+    chosen = [item for item in collection if item.id not in config.excluded]
+    order = numpy_generator(config.views.seed, "order of objects").permutation(len(chosen))
+    plan = Plan(
+        tuple(chosen[i] for i in order), tuple(str(path) for path in usable), config.views, config.objects_per_shard
+    )
+    key = {"schema": SCHEMA, "stage": STAGE, "config": to_json(config)}
+    made_from = {"objects": _collection_digest(collection), "lights": fingerprint(lights)}
+    start = time.monotonic()
+    with locked(storage.path) if storage.path else nullcontext():
+        _check_key(storage, key, made_from)
+        storage.remove_leftovers()
+        storage.write_json("config.json", key)
+        storage.write_json("inputs.json", made_from)
+        finished = _finished(storage, plan)
+        if len(finished) < len(plan.shards()) or not storage.exists("DONE"):
+            storage.remove("DONE")
+            finished |= _render_missing(storage, plan, set(finished), execution)
+            manifest = _manifest(plan, config, finished, unusable_lights)
+            storage.write_json("manifest.json", manifest)
+            rendered = {name: manifest[name] for name in ("num_items", "num_ordered_pairs", "left_out_by_reason")}
+            storage.write_json("provenance.json", provenance(time.monotonic() - start, rendered))
+            storage.write("DONE", (hashlib.sha256(storage.read("manifest.json")).hexdigest() + "\n").encode())
     return out
 
 
-def _in_rounds(objects: list[Path], num_views: int) -> Iterator[tuple[Path, int]]:
-    for view in range(num_views):
-        for path in objects:
-            yield path, view
+def _objects(folder: Path) -> list[ObjectFile]:
+    if not folder.is_dir():
+        raise UserError(f"{folder} does not exist", wanted="a folder of model files")
+    paths = sorted(folder.glob("*.glb"))
+    if not paths:
+        raise UserError(f"{folder} holds no objects", wanted=".glb files")
+    return [ObjectFile(path.stem, str(path)) for path in paths]
 
 
-def _load_lights(folder: Path, wanted: int) -> list[EnvironmentMap]:
-    paths = sorted([*folder.glob("*.exr"), *folder.glob("*.hdr")])
-    if len(paths) < wanted:
-        raise UserError(f"{folder} holds too few lights", got=str(len(paths)), wanted=f"{wanted} .exr or .hdr maps")
-    return [_at_height(EnvironmentMap.load(path)) for path in paths]
+def _collection_digest(collection: list[ObjectFile]) -> str:
+    """Names and sizes; contents are hashed when they are read, and recorded in each item."""
+    lines = (f"{item.id}\0{Path(item.path).stat().st_size}\n" for item in collection)
+    return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
 
 
-def _at_height(light: EnvironmentMap) -> EnvironmentMap:
-    """All lights of one scene have one resolution; larger maps are averaged, smaller ones repeated."""
-    height = light.linear_rgb.shape[0]
-    if height > _LIGHT_HEIGHT:
-        return light.resized(_LIGHT_HEIGHT)
-    if _LIGHT_HEIGHT % height:
-        raise UserError(f"the light '{light.name}' has an odd size", got=f"{height} rows", wanted="a power of two")
-    factor = _LIGHT_HEIGHT // height
-    return EnvironmentMap(light.linear_rgb.repeat(factor, 0).repeat(factor, 1), light.name)
+def _usable_lights(folder: Path, settings: ViewSettings) -> tuple[list[Path], dict[str, str]]:
+    """Maps that can light a scene, and what is wrong with the others by name."""
+    paths = light_paths(folder)
+    usable, unusable = [], {}
+    with step_progress("check lights", len(paths)) as progress:
+        for path in paths:
+            try:
+                load_light(path, settings.light_height)
+                usable.append(path)
+            except UserError as error:
+                unusable[path.stem] = str(error)
+                say(f"the light {path.stem} is left out: {error}")
+            progress.advance()
+    if len(usable) < settings.num_lights:
+        raise UserError(
+            f"{folder} holds too few lights",
+            got=f"{len(usable)} usable and {len(unusable)} unusable maps",
+            wanted=f"{settings.num_lights} .exr or .hdr maps",
+        )
+    return usable, unusable
 
 
-def item_camera(config: Config, vertices: np.ndarray, generator: np.random.Generator) -> Cameras:
-    """One camera on a sphere about an object, whose field of view the object just fills.
-
-    Args:
-        config: distances, elevations, size.
-        vertices: the object's points [vertices, 3], in the unit sphere.
-        generator: draws distance and direction.
-    """
-    distance = float(generator.uniform(config.min_distance, config.max_distance))
-    size, low = config.size, config.min_elevation_radians
-    camera = sphere_cameras(1, distance, np.pi / 2, size, size, generator, min_elevation_radians=low)
-    points, _ = camera.project(vertices)
-    tangent = np.abs(points[0] / (size / 2) - 1).max()
-    intrinsics = camera.intrinsics.copy()
-    intrinsics[:, :2] = size / 2 / (tangent * config.margin)
-    return Cameras(camera.world_from_camera, intrinsics, size, size)
-
-
-def _render_item(path: Path, view: int, maps: list[EnvironmentMap], config: Config, item: Path) -> str | None:
-    """Render and write one item; the reason where the object is broken."""
-    generator = numpy_generator(config.seed, "item", path.stem, view)
+def _check_key(storage: Storage, key: dict[str, Any], made_from: dict[str, str]) -> None:
     try:
-        parts = load_object(path, numpy_generator(config.seed, "object", path.stem))
-    except UserError as error:
-        return str(error)
-    if generator.random() < config.vary_probability:
-        parts = varied(parts, generator)
-    vertices = np.concatenate([mesh.vertices[np.unique(mesh.faces)] for mesh, _ in parts])
-    camera = item_camera(config, vertices, generator)
-    chosen = generator.choice(len(maps), config.num_lights, replace=False)
-    draws = [draw_light(maps[index], generator, config.flip_probability) for index in chosen]
-    seed = derived_seed(config.seed, "render", path.stem, view)
-    renderer = MitsubaItemRenderer(config.samples_per_pixel, config.cue_sampling, config.bakes_textures)
-    rendered = renderer.render(parts, camera, [light for light, _ in draws], seed)
-    coverage = float(rendered.alpha.mean())
-    if coverage == 0:
-        return "nothing to be seen in a view"
-    metadata = {
-        "object": path.stem,
-        "view": view,
-        "split": config.split,
-        "lights": [to_json(draw) for _, draw in draws],
-        "camera": camera.to_dict(),
-        "coverage": coverage,
-    }
-    save_checkpoint(item, _tensors(rendered), metadata)
-    return None
+        old_key, old_inputs = (json.loads(storage.read(name)) for name in ("config.json", "inputs.json"))
+    except (FileNotFoundError, ValueError):
+        strangers = [name for name in storage.names() if name not in ("config.json", "inputs.json", ".lock")]
+        if strangers:
+            raise UserError(
+                f"{storage.url} holds files that are not a run of this program",
+                got=strangers[0],
+                fix="choose an empty or a new folder with --out",
+            ) from None
+        return
+    refuse_other_key(storage.url, old_key, key, old_inputs, made_from)
 
 
-def _tensors(item: RenderedItem) -> dict[str, torch.Tensor]:
+def _finished(storage: Storage, plan: Plan) -> dict[str, ShardIndex]:
+    """Shards whose bytes are as they were written; damaged ones are taken away, to be made again."""
+    finished = {}
+    names = plan.shards()
+    with step_progress("check shards", len(names)) as progress:
+        for name in names:
+            index = read_index(storage, name)
+            if index is not None and is_intact(storage, index):
+                finished[name] = index
+            elif index is not None:
+                say(f"{storage.url}/{name}.tar is damaged or missing, and is made again")
+                remove_shard(storage, name)
+            progress.advance()
+    return finished
+
+
+def _render_missing(storage: Storage, plan: Plan, finished: set[str], execution: Execution) -> dict[str, ShardIndex]:
+    """Render and pack all shards that are not finished."""
+    plan_file = plan.write(storage)
+    made: dict[str, ShardIndex] = {}
+    shards = {name: members for name, members in plan.shards().items() if name not in finished}
+    per_object = plan.views.num_views
+    num_items = len(plan.objects) * per_object
+    done = num_items - per_object * sum(map(len, shards.values()))
+    with step_progress("render training pairs", num_items, done) as progress, open_pool(execution) as pool:
+        waiting = iter([index for members in shards.values() for index in members])
+        driver = _Driver(storage, plan, plan_file, pool, progress, {name: set(m) for name, m in shards.items()}, made)
+        while True:
+            while pool.num_running() < pool.capacity and (index := next(waiting, None)) is not None:
+                pool.submit(render_object, ObjectTask(storage.url, plan_file, index))
+            if not pool.num_running():
+                break
+            driver.take(*pool.next_done())
+    storage.remove(plan_file)
+    for folder in (*(f"staging/{name}" for name in shards), "staging"):
+        storage.remove_empty(folder)
+    return made
+
+
+@dataclass
+class _Driver:
+    """What to do when a task is done."""
+
+    storage: Storage
+    plan: Plan
+    plan_file: str
+    pool: TaskPool
+    progress: StepProgress
+    missing: dict[str, set[int]]
+    """Objects by shard that are still to come."""
+    made: dict[str, ShardIndex]
+    num_left_out: int = 0
+
+    def take(self, task: ObjectTask | PackTask, outcome: Any) -> None:
+        """Count a finished object or shard; pack a shard when its last object is there."""
+        if isinstance(task, PackTask):
+            self._packed(task, outcome)
+            return
+        shard = self.plan.shard_name(task.index)
+        if isinstance(outcome, Crash):
+            outcome = leave_out_missing(self.storage, self.plan, task.index, LeftOut("crash", outcome.message))
+        for key, left_out in outcome.items():
+            self.num_left_out += left_out is not None
+            if left_out is not None and key.endswith("_0"):
+                say(f"left out {key}: {left_out.message}")
+        self.progress.advance(self.plan.views.num_views, left_out=float(self.num_left_out))
+        self.missing[shard].discard(task.index)
+        if not self.missing[shard]:
+            self.pool.submit(pack_shard, PackTask(self.storage.url, self.plan_file, shard))
+
+    def _packed(self, task: PackTask, outcome: Any) -> None:
+        if isinstance(outcome, Crash):
+            raise UserError(f"packing {task.shard} failed", got=outcome.message, fix="run the same command again")
+        if isinstance(outcome, ShardIndex):
+            self.made[task.shard] = outcome
+            return
+        self.missing[task.shard] = set(outcome)
+        for index in outcome:  # staged items that are damaged: once more
+            say(f"a staged item of {self.plan.objects[index].id} is damaged, and is made again")
+            self.pool.submit(render_object, ObjectTask(self.storage.url, self.plan_file, index))
+
+
+def _manifest(
+    plan: Plan, config: Config, shards: dict[str, ShardIndex], unusable_lights: dict[str, str]
+) -> dict[str, Any]:
+    left_out = {key: why for index in shards.values() for key, why in index.left_out.items()}
+    num_items = sum(len(index.keys) for index in shards.values())
+    num_lights = plan.views.num_lights
     return {
-        "targets": _half(item.targets),
-        "cues": _half(item.cues),
-        "alpha": _byte(item.alpha),
-        "albedo": _byte(srgb_from_linear(item.base_color)),
-        "roughness": _byte(item.roughness),
-        "metallic": _byte(item.metallic),
-        "normal": _half(item.normal),
+        "num_objects": len(plan.objects),
+        "num_items": num_items,
+        "num_ordered_pairs": num_items * num_lights * (num_lights - 1),
+        "shards": {
+            name: {"sha256": index.sha256, "num_bytes": index.num_bytes, "num_items": len(index.keys)}
+            for name, index in sorted(shards.items())
+        },
+        "excluded": sorted(config.excluded),
+        "left_out": {key: to_json(why) for key, why in sorted(left_out.items())},
+        "left_out_by_reason": dict(sorted(Counter(why.reason for why in left_out.values()).items())),
+        "lights": sorted(Path(path).stem for path in plan.lights),
+        "lights_left_out": dict(sorted(unusable_lights.items())),
+        "licences": {item.id: item.licence for item in sorted(plan.objects, key=lambda item: item.id) if item.licence},
     }
-
-
-def _half(array: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(np.clip(array, -_HALF_MAX, _HALF_MAX))).half()
-
-
-def _byte(array: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(np.rint(np.clip(array, 0, 1) * 255))).to(torch.uint8)

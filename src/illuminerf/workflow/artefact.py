@@ -67,7 +67,7 @@ def open_artefact(out: Path, stage: str, config: Any, inputs: dict[str, Path | s
     if is_done:
         yield Artefact(out, stage, is_done=True, finished=True)
         return
-    with _locked(out):
+    with locked(out):
         remove_partial_files(out)
         write_json(out / "config.json", key)
         write_json(out / "inputs.json", made_from)
@@ -127,9 +127,21 @@ def _check_key(out: Path, key: dict[str, Any], made_from: dict[str, str]) -> boo
                 fix="choose an empty or a new folder with --out",
             )
         return False
-    difference = first_difference(read_json(config_file), key)
-    if difference is None and inputs_file.exists():
-        old_inputs = read_json(inputs_file)
+    refuse_other_key(
+        str(out), read_json(config_file), key, read_json(inputs_file) if inputs_file.exists() else made_from, made_from
+    )
+    if not (out / "DONE").exists():
+        return False
+    verify(out)
+    return True
+
+
+def refuse_other_key(
+    out: str, old_key: Any, key: dict[str, Any], old_inputs: dict[str, str], made_from: dict[str, str]
+) -> None:
+    """Raise a UserError that names what differs where a folder was made by another stage, config or input."""
+    difference = first_difference(old_key, key)
+    if difference is None:
         changed = next((role for role in made_from if old_inputs.get(role) != made_from[role]), None)
         difference = f"its input '{changed}' has changed" if changed else None
     if difference:
@@ -137,36 +149,33 @@ def _check_key(out: Path, key: dict[str, Any], made_from: dict[str, str]) -> boo
             f"{out} was made with other settings: {difference}",
             fix="choose another --out, delete that folder, or use the settings it was made with",
         )
-    if not (out / "DONE").exists():
-        return False
-    verify(out)
-    return True
 
 
 def _seal(artefact: Artefact, seconds: float) -> None:
-    provenance_file = artefact.path / "provenance.json"
-    write_json(
-        provenance_file,
-        {
-            "versions": {name: _version(name) for name in _VERSIONED},
-            "python": platform.python_version(),
-            "platform": platform.platform(),
-            "commit": _commit(),
-            "seconds": round(seconds, 3),
-            "peak_memory_gb": round(peak_memory_gb(), 3),
-            "metrics": artefact.metrics,
-        },
-    )
+    write_json(artefact.path / "provenance.json", provenance(seconds, artefact.metrics))
     write_bytes(artefact.path / "DONE", (_artefact_digest(artefact.path) + "\n").encode())
+
+
+def provenance(seconds: float, metrics: dict[str, Any]) -> dict[str, Any]:
+    """Where, with what and how long something was made: versions, commit, seconds, peak memory, measurements."""
+    return {
+        "versions": {name: _version(name) for name in _VERSIONED},
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "commit": _commit(),
+        "seconds": round(seconds, 3),
+        "peak_memory_gb": round(peak_memory_gb(), 3),
+        "metrics": metrics,
+    }
 
 
 def read_metrics(out: Path) -> dict[str, Any]:
     """What the stage measured, with `seconds` and `peak_memory_gb` of the process that finished it."""
-    provenance = read_json(out / "provenance.json")
+    recorded = read_json(out / "provenance.json")
     return {
-        **provenance["metrics"],
-        "seconds": provenance["seconds"],
-        "peak_memory_gb": provenance["peak_memory_gb"],
+        **recorded["metrics"],
+        "seconds": recorded["seconds"],
+        "peak_memory_gb": recorded["peak_memory_gb"],
     }
 
 
@@ -196,7 +205,7 @@ def _file_digest(path: Path) -> str:
 
 
 @contextmanager
-def _locked(out: Path) -> Iterator[None]:
+def locked(out: Path) -> Iterator[None]:
     """Keep two processes from working on one artefact; the kernel drops the lock when a process dies."""
     import fcntl
 

@@ -60,6 +60,10 @@ def _coerced(name: str, hint: Any, value: Any) -> Any:
         if len(items) != len(value):
             raise UserError(f"{name} has {len(value)} entries", wanted=str(len(items)))
         return tuple(_coerced(name, item, entry) for item, entry in zip(items, value, strict=True))
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise UserError(f"{name} must be an object", got=type(value).__name__)
+        return {key: _coerced(f"{name}.{key}", arguments[1], entry) for key, entry in value.items()}
     if origin is typing.Literal:
         if value not in arguments:
             raise UserError(f"{name} is not a known choice", got=repr(value), wanted=", ".join(map(str, arguments)))

@@ -1,0 +1,152 @@
+"""Training pairs as shards: the plan, and the two kinds of task that carry it out on any number of machines.
+
+An item that is rendered waits in `staging/<shard>/<key>.item` (its sha256, then a little tar); where there can be none,
+`<key>.json` there says why. When all items of a shard wait, they are joined.
+"""
+
+import functools
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from illuminerf.cues.object_views import ObjectFile, ViewSettings, item_key, render_views
+from illuminerf.scene.relighting_pairs import PREFIX
+from illuminerf.workflow.config import from_json, to_json
+from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.shards import LeftOut, ShardIndex, sample_tar, write_shard
+from illuminerf.workflow.storage import Storage
+
+_DIGEST_BYTES = 32
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything a worker needs to know; written once, so that tasks stay small."""
+
+    objects: tuple[ObjectFile, ...]
+    """In the order in which they are dealt to shards."""
+    lights: tuple[str, ...]
+    """Paths of usable maps."""
+    views: ViewSettings
+    """What is rendered of each object."""
+    objects_per_shard: int
+    """Objects whose views share one shard."""
+
+    def shard_name(self, index: int) -> str:
+        """The shard that an object's items go to."""
+        return f"{PREFIX}{index // self.objects_per_shard:06d}"
+
+    def shards(self) -> dict[str, list[int]]:
+        """Object indices by shard."""
+        result: dict[str, list[int]] = {}
+        for index in range(len(self.objects)):
+            result.setdefault(self.shard_name(index), []).append(index)
+        return result
+
+    def keys(self, index: int) -> list[str]:
+        """Item keys of one object."""
+        return [item_key(self.objects[index].id, view) for view in range(self.views.num_views)]
+
+    def write(self, storage: Storage) -> str:
+        """Store the plan for workers to read; its name."""
+        content = to_json(self)
+        name = f"staging/plan-{hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]}.json"
+        storage.write_json(name, content)
+        return name
+
+
+@dataclass(frozen=True)
+class ObjectTask:
+    """Render what is missing of one object."""
+
+    out: str
+    plan: str
+    index: int
+
+
+@dataclass(frozen=True)
+class PackTask:
+    """Join the staged items of one shard."""
+
+    out: str
+    plan: str
+    shard: str
+
+
+@functools.lru_cache(maxsize=2)
+def read_plan(out: str, name: str) -> Plan:
+    """What `Plan.write` stored; read once per process."""
+    return from_json(Plan, json.loads(Storage(out).read(name)))
+
+
+def render_object(task: ObjectTask) -> dict[str, LeftOut | None]:
+    """Render the views of one object that are not staged yet; by key, None or why there is no item."""
+    storage, plan = Storage(task.out), read_plan(task.out, task.plan)
+    folder, keys = f"staging/{plan.shard_name(task.index)}", plan.keys(task.index)
+    staged = set(storage.names(folder))
+    views = [view for view, key in enumerate(keys) if not staged & {f"{key}.item", f"{key}.json"}]
+    result: dict[str, LeftOut | None] = {key: None for key in keys}
+    lights = [Path(path) for path in plan.lights]
+    for view, made in render_views(list(plan.objects), task.index, lights, plan.views, views):
+        if isinstance(made, LeftOut):
+            result[keys[view]] = made
+            storage.write_json(f"{folder}/{keys[view]}.json", to_json(made))
+        else:
+            content = sample_tar(keys[view], made)
+            storage.write(f"{folder}/{keys[view]}.item", hashlib.sha256(content).digest() + content)
+    return result
+
+
+def leave_out_missing(storage: Storage, plan: Plan, index: int, why: LeftOut) -> dict[str, LeftOut | None]:
+    """Give up what an object's dead worker had not staged."""
+    folder = f"staging/{plan.shard_name(index)}"
+    staged = set(storage.names(folder))
+    result: dict[str, LeftOut | None] = {}
+    for key in plan.keys(index):
+        if f"{key}.item" not in staged and f"{key}.json" not in staged:
+            storage.write_json(f"{folder}/{key}.json", to_json(why))
+            result[key] = why
+    return result
+
+
+def pack_shard(task: PackTask) -> ShardIndex | list[int]:
+    """Join the staged items of a shard and write it; or the objects whose staged items are damaged or gone."""
+    storage, plan = Storage(task.out), read_plan(task.out, task.plan)
+    folder = f"staging/{task.shard}"
+    samples: list[bytes] = []
+    left_out: dict[str, LeftOut] = {}
+    damaged = []
+    for index in plan.shards()[task.shard]:
+        for key in plan.keys(index):
+            staged = _staged(storage, folder, key)
+            if isinstance(staged, LeftOut):
+                left_out[key] = staged
+            elif staged is not None:
+                samples.append(staged)
+            elif index not in damaged:
+                damaged.append(index)
+    if damaged:
+        return damaged
+    index_file = write_shard(storage, task.shard, samples, left_out)
+    for name in storage.names(folder):
+        storage.remove(f"{folder}/{name}")
+    return index_file
+
+
+def _staged(storage: Storage, folder: str, key: str) -> bytes | LeftOut | None:
+    """A staged item's little tar, why there is none, or None where it must be made again."""
+    try:
+        content = storage.read(f"{folder}/{key}.item")
+        if hashlib.sha256(content[_DIGEST_BYTES:]).digest() == content[:_DIGEST_BYTES]:
+            return content[_DIGEST_BYTES:]
+        storage.remove(f"{folder}/{key}.item")
+    except FileNotFoundError:
+        pass
+    try:
+        return from_json(LeftOut, json.loads(storage.read(f"{folder}/{key}.json")))
+    except FileNotFoundError:
+        return None
+    except (ValueError, UserError):
+        storage.remove(f"{folder}/{key}.json")
+        return None

@@ -1,0 +1,124 @@
+"""A folder anywhere: on this machine or behind any fsspec URL (s3://, gs://, memory://). Writes are whole or absent."""
+
+import errno
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import fsspec
+from fsspec.implementations.local import LocalFileSystem
+
+from illuminerf.workflow.atomic import remove_partial_files, write_bytes
+from illuminerf.workflow.errors import UserError
+
+_CHUNK = 2**22
+
+
+class Storage:
+    """Named files below one root.
+
+    Args:
+        url: a path or an fsspec URL; credentials come from where that file system looks for them.
+
+    Raises:
+        UserError: the protocol is unknown or its package is not installed.
+    """
+
+    def __init__(self, url: str | Path) -> None:
+        self.url = str(url)
+        try:
+            self._fs, self._root = fsspec.core.url_to_fs(self.url)
+        except (ValueError, ImportError) as error:
+            raise UserError(
+                f"{self.url} is no place this program can write to",
+                got=str(error),
+                wanted="a folder or an fsspec URL",
+                fix="install the package of that file system, for example pip install s3fs",
+            ) from error
+        self._root = self._root.rstrip("/") or "/"
+
+    @property
+    def path(self) -> Path | None:
+        """The root where it lies on this machine's file systems, else None."""
+        return Path(self._root) if isinstance(self._fs, LocalFileSystem) else None
+
+    def _path(self, name: str) -> str:
+        if name.startswith("/") or ".." in name.split("/"):
+            raise UserError(f"'{name}' would leave {self.url}", wanted="a name below it")
+        return f"{self._root}/{name}" if name else self._root
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a file: on local file systems by rename, elsewhere by one upload, which object stores make atomic.
+
+        Raises:
+            UserError: the disk is full, or the place may not be written.
+        """
+        path = self._path(name)
+        if self.path:
+            write_bytes(Path(path), content)
+            return
+        try:
+            self._fs.makedirs(path.rpartition("/")[0], exist_ok=True)
+            self._fs.pipe_file(path, content)
+        except OSError as error:
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            raise UserError(
+                f"{self.url}/{name} cannot be written",
+                got=str(error),
+                fix="free some space and run again" if full else "check the address and the credentials",
+            ) from error
+
+    def write_json(self, name: str, content: Any) -> None:
+        """Write JSON with sorted keys, so that equal contents are equal bytes."""
+        self.write(name, (json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
+
+    def read(self, name: str) -> bytes:
+        """A file's content.
+
+        Raises:
+            FileNotFoundError: there is none.
+        """
+        return bytes(self._fs.cat_file(self._path(name)))
+
+    def chunks(self, name: str) -> Iterator[bytes]:
+        """A file's content in pieces of a few MB.
+
+        Raises:
+            FileNotFoundError: there is none.
+        """
+        with self._fs.open(self._path(name), "rb") as stream:
+            while piece := stream.read(_CHUNK):
+                yield piece
+
+    def exists(self, name: str = "") -> bool:
+        """Whether there is a file of that name now."""
+        self._fs.invalidate_cache()
+        return bool(self._fs.exists(self._path(name)))
+
+    def names(self, folder: str = "") -> list[str]:
+        """Names of the files directly in `folder`, sorted, without the folder; none where it does not exist."""
+        self._fs.invalidate_cache()
+        try:
+            entries = self._fs.ls(self._path(folder), detail=True)
+        except FileNotFoundError:
+            return []
+        files = (entry["name"].rpartition("/")[2] for entry in entries if entry["type"] == "file")
+        return sorted(name for name in files if name and not name.startswith("."))
+
+    def remove(self, name: str) -> None:
+        """Delete a file; no error where there is none."""
+        try:
+            self._fs.rm_file(self._path(name))
+        except FileNotFoundError:
+            return
+
+    def remove_empty(self, folder: str) -> None:
+        """Delete a folder that holds nothing; no error where there is none (object stores have no folders)."""
+        if self.path and (path := Path(self._path(folder))).is_dir() and not any(path.iterdir()):
+            path.rmdir()
+
+    def remove_leftovers(self) -> None:
+        """Delete what a killed process had half written; whole files are never touched."""
+        if self.path and self.path.is_dir():
+            remove_partial_files(self.path)
