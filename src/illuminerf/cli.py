@@ -17,6 +17,7 @@ from illuminerf.stages import (
     evaluate_relighting,
     fit_latent_nerf,
     import_capture,
+    preview_training_pairs,
     relight_views,
     render_demo_capture,
     render_novel_views,
@@ -30,6 +31,7 @@ from illuminerf.workflow.task_pool import Execution
 
 PositionalPath = Annotated[Path, tyro.conf.Positional]
 _DEFAULT_PAIRS = render_training_pairs.Config()
+_DEFAULT_PREVIEW = preview_training_pairs.Config()
 _ALL_CORES = Execution(workers=os.cpu_count() or 1)
 
 
@@ -105,6 +107,22 @@ def render_training_pairs_command(
         execution: Where.
     """
     render_training_pairs.run(objects, lights, config, out, execution)
+    say(f"done: {out}")
+
+
+def preview_command(
+    pairs: tyro.conf.Positional[str],
+    out: Path = Path("pairs.png"),
+    config: Annotated[preview_training_pairs.Config, tyro.conf.arg(name="")] = _DEFAULT_PREVIEW,
+) -> None:
+    """Draw a contact sheet of training pairs: lights, cues, materials, normals, composited materials.
+
+    Args:
+        pairs: Folder or fsspec URL that render-training-pairs wrote or is writing.
+        out: The .png to write.
+        config: What the sheet shows.
+    """
+    preview_training_pairs.run(pairs, config, out)
     say(f"done: {out}")
 
 
@@ -190,7 +208,10 @@ COMMANDS: dict[str, Callable[..., Any]] = {
         render_demo_capture.run, render_demo_capture.Config, "Render the bundled demo capture from its formulas.", {}
     ),
 }
-GROUPS: dict[str, dict[str, Callable[..., None]]] = {"benchmark": {"tensoir": benchmark.tensoir_command}}
+GROUPS: dict[str, dict[str, Callable[..., None]]] = {
+    "benchmark": {"tensoir": benchmark.tensoir_command},
+    "data": {"preview": preview_command},
+}
 
 
 def main(arguments: list[str] | None = None) -> None:

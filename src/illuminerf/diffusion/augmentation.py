@@ -94,6 +94,13 @@ def _example(
     return example
 
 
+def composited_target(
+    item: TrainingItem, albedo_item: TrainingItem, cues: Float[Tensor, "12 height width"], generator: torch.Generator
+) -> Float[Tensor, "3 height width"]:
+    """What an item would look like in a random material, from its cues alone; linear, straight."""
+    return _composited(cues, *_random_material(item, albedo_item, generator))
+
+
 def _mixture(order: list[int], config: AugmentationConfig, generator: torch.Generator) -> Tensor:
     """Weights [lights, 3] of one light, or of two, tinted; the first of `order` dominates."""
     weights = torch.zeros(len(order), 3)

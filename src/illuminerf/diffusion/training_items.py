@@ -41,13 +41,18 @@ def load_items(folder: str | Path, size: int) -> list[TrainingItem]:
     Raises:
         UserError: there is no item, or one is damaged or larger than `size` by no whole factor.
     """
-    items = [_averaged(key, arrays, size) for key, arrays, _ in iterate_items(folder)]
+    items = [training_item(key, arrays, size) for key, arrays, _ in iterate_items(folder)]
     if not items:
         raise UserError(f"{folder} holds no training items", wanted="pairs-000000.tar, ...", fix="render pairs first")
     return sorted((item for item in items if _is_usable(item)), key=lambda item: item.name)
 
 
-def _averaged(name: str, arrays: dict[str, np.ndarray], size: int) -> TrainingItem:
+def training_item(name: str, arrays: dict[str, np.ndarray], size: int) -> TrainingItem:
+    """One item from its dense arrays (see `scene.relighting_pairs.decode_item`), area-averaged to `size` pixels.
+
+    Raises:
+        UserError: the item is larger than `size` by no whole factor.
+    """
     tensors = {field: torch.from_numpy(values) for field, values in arrays.items()}
     height = tensors["targets"].shape[-1]
     if height % size:

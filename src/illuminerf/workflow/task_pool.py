@@ -8,6 +8,7 @@ import faulthandler
 import importlib
 import multiprocessing
 import os
+import socket
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -16,6 +17,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from illuminerf.workflow.errors import UserError
+
+_CONNECT_SECONDS = 5.0
 
 
 @dataclass(frozen=True)
@@ -164,9 +167,12 @@ def _ray_pool(execution: Execution) -> Iterator[TaskPool]:
         ray = importlib.import_module("ray")
     except ImportError as error:
         raise UserError("Ray is not installed", fix="pip install 'illuminerf[cluster]'") from error
+    host, _, port = execution.ray_address.rpartition(":")
     try:
+        if host and port.isdigit():  # Ray itself would keep trying for minutes
+            socket.create_connection((host, int(port)), _CONNECT_SECONDS).close()
         ray.init(address=execution.ray_address, log_to_driver=False, ignore_reinit_error=True)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         raise UserError(
             f"no Ray cluster answers at '{execution.ray_address}'",
             got=str(error).splitlines()[0],
