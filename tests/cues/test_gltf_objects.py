@@ -10,7 +10,8 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from illuminerf.cues.gltf_objects import load_object, varied
+from illuminerf.cues.object_files import load_object
+from illuminerf.cues.variations import varied
 from illuminerf.workflow.errors import UserError
 
 

@@ -18,10 +18,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from illuminerf.cues.gltf_objects import load_object, varied
 from illuminerf.cues.item_renderer import MitsubaItemRenderer, RenderedItem
+from illuminerf.cues.object_files import load_object
 from illuminerf.cues.renderer import CueSampling
 from illuminerf.cues.training_lights import draw_light
+from illuminerf.cues.variations import varied
 from illuminerf.scene.cameras import Cameras, sphere_cameras
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import srgb_from_linear
@@ -64,7 +65,7 @@ class Config:
     flip_probability: float = 0.5
     """How often a light is turned upside down."""
     vary_probability: float = 0.5
-    """How often an item's materials are replaced at random (see `gltf_objects.varied`).
+    """How often an item's materials are replaced at random (see `variations.varied`).
     Deviation: not in the paper, which has 150,000 objects where small collections have a hundred."""
     bakes_textures: bool = True
     """Move textures onto vertices, which saves compiling kernels; turn off above 128 pixels."""
