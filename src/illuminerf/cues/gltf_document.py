@@ -17,7 +17,14 @@ from illuminerf.cues.broken_object import BrokenObject
 from illuminerf.cues.raw_objects import ImageFile, ReadingLimits, file_beside
 
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
-_DTYPES: dict[Any, Any] = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+_DTYPES: dict[Any, Any] = {
+    5120: np.int8,
+    5121: np.uint8,
+    5122: np.int16,
+    5123: np.uint16,
+    5125: np.uint32,
+    5126: np.float32,
+}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # required extensions that change nothing we read, or that `gltf_scenes` understands
 _KNOWN_EXTENSIONS = {

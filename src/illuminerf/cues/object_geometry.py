@@ -115,10 +115,10 @@ def _with_normals(part: RawPart) -> RawPart:
     flat = crossed / np.linalg.norm(crossed, axis=-1, keepdims=True)
     given = _sound(part.normals, flat)
     if given is None:
-        return _with_computed_normals(part, crossed, flat)
+        return _with_computed_normals(part, corners, flat)
     is_missing = (given == 0).all(1)
     if is_missing.any():
-        given = np.where(is_missing[:, None], _smooth(part, crossed, flat), given)
+        given = np.where(is_missing[:, None], _smooth(part, corners, flat), given)
     # Exporters mirror without turning the winding, or write normals for one side of a sheet: the normals are trusted,
     # since they are what is shaded.
     looks_back = np.einsum("fi,fi->f", flat, given[part.faces].sum(1)) < 0
@@ -141,18 +141,25 @@ def _sound(normals: np.ndarray | None, flat: np.ndarray) -> np.ndarray | None:
     return unit
 
 
-def _smooth(part: RawPart, crossed: np.ndarray, flat: np.ndarray) -> np.ndarray:
-    """Area-weighted normals [V, 3], equal at equal positions even where a seam of the texture splits vertices."""
+def _smooth(part: RawPart, corners: np.ndarray, flat: np.ndarray) -> np.ndarray:
+    """Normals [V, 3] weighted by the faces' angles at the vertex, so that it does not matter how a polygon was cut;
+    equal at equal positions even where a seam of the texture splits vertices."""
     place = _places(part.vertices)
-    corner_place = place[part.faces].ravel()
-    summed = np.stack(
-        [np.bincount(corner_place, np.repeat(crossed[:, i], 3), int(place.max()) + 1) for i in range(3)], -1
-    )[place]
+    num_places = int(place.max()) + 1
+    summed = np.zeros((num_places, 3))
+    for corner in range(3):
+        to_next, to_last = (corners[:, (corner + step) % 3] - corners[:, corner] for step in (1, 2))
+        across = np.linalg.norm(np.cross(to_next, to_last), axis=-1)
+        angle = np.arctan2(across, np.einsum("fi,fi->f", to_next, to_last))
+        where = place[part.faces[:, corner]]
+        for axis in range(3):
+            summed[:, axis] += np.bincount(where, angle * flat[:, axis], num_places)
+    summed = summed[place]
     length = np.linalg.norm(summed, axis=1, keepdims=True)
     # two sides of a thin sheet cancel out; any of the faces will do there
     any_face = np.zeros_like(summed)
     any_face[part.faces.ravel()] = np.repeat(flat, 3, axis=0)
-    return np.where(length > 1e-20, summed / np.maximum(length, 1e-20), any_face)
+    return np.where(length > 1e-6, summed / np.maximum(length, 1e-6), any_face)
 
 
 def _places(vertices: np.ndarray) -> np.ndarray:
@@ -166,9 +173,9 @@ def _places(vertices: np.ndarray) -> np.ndarray:
     return np.unique(mixed, return_inverse=True)[1]
 
 
-def _with_computed_normals(part: RawPart, crossed: np.ndarray, flat: np.ndarray) -> RawPart:
+def _with_computed_normals(part: RawPart, corners: np.ndarray, flat: np.ndarray) -> RawPart:
     """Smooth normals, but sharp creases: corners there get vertices of their own."""
-    smooth = _smooth(part, crossed, flat)
+    smooth = _smooth(part, corners, flat)
     is_sharp = np.einsum("fci,fi->fc", smooth[part.faces], flat) < _CREASE_COSINE
     faces = part.faces.copy()
     source = part.faces[is_sharp]

@@ -167,7 +167,13 @@ def _shape(mesh: TriangleMesh, material: Material, device: str, unlit: bool = Fa
         bsdf = {"type": "diffuse", "reflectance": sources[0]}
     elif material.normal_map is not None:
         coded = mi.Bitmap(np.array(material.normal_map / 2 + 0.5, np.float32, order="C"))
-        bsdf = {"type": "normalmap", "normalmap": {"type": "bitmap", "bitmap": coded, "raw": True}, "bsdf": bsdf}
+        bsdf = {
+            "type": "normalmap",
+            "normalmap": {"type": "bitmap", "bitmap": coded, "raw": True},
+            # darkens what tilts away from the face; smooth vertex normals, ours and Blender's, have no such term
+            "use_shadowing_function": False,
+            "bsdf": bsdf,
+        }
     two_sided = {"type": "twosided", "front": bsdf}
     return mitsuba_mesh(mi, "part", mesh.vertices, mesh.faces, two_sided, mesh.vertex_normals, material.uv, attributes)
 
