@@ -60,7 +60,8 @@ def _placed_nodes(document: GltfDocument) -> Iterator[Placed]:
         if num_seen > max(len(document.items("nodes")), 1) or num_seen > _MAX_NODES:
             raise document.broken("nodes that are their own ancestors, or too many")
         node = document.item("nodes", index)
-        transform = world_from_parent @ _local(document, node)
+        with np.errstate(all="ignore"):  # what is not finite is found in the vertices
+            transform = world_from_parent @ _local(document, node)
         yield node, transform
         stack += [(child, transform) for child in reversed(node.get("children", []))]
 
