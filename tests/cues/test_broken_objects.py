@@ -54,9 +54,7 @@ def textured(image: bytes | str, alpha: float = 1.0, **material: Any) -> Gltf:
         (1.0, 255, {"extensions": {"KHR_materials_transmission": {}}}, False),
     ],
 )
-def test_transparency(
-    tmp_path: Path, alpha: float, image_alpha: int, material: dict[str, Any], is_clear: bool
-) -> None:
+def test_transparency(tmp_path: Path, alpha: float, image_alpha: int, material: dict[str, Any], is_clear: bool) -> None:
     path = textured(png((200, 100, 50, image_alpha)), alpha, **material).glb(tmp_path / "a.glb")
     assert reason(path)[0] == "transparent" if is_clear else is_kept(path)
 
