@@ -81,7 +81,8 @@ def test_obj_polygons_of_every_spelling(tmp_path: Path, faces: str) -> None:
 def test_obj_materials_are_kept_apart(tmp_path: Path) -> None:
     library = "newmtl red wood\nKd 0.5 0 0\nNs 98\nKs 1 1 1\nillum 2\nnewmtl blue\nKd 0 0 0.5\nillum 1\n"
     (tmp_path / "a.mtl").write_text(library)
-    text = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nusemtl red wood\nf 1 2 3\nusemtl blue\nf 1 3 4\nusemtl red wood\nf 1 4 2\n"
+    text = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+    text += "usemtl red wood\nf 1 2 3\nusemtl blue\nf 1 3 4\nusemtl red wood\nf 1 4 2\n"
     red, blue = load(obj(tmp_path, text))
     assert (len(red[0].faces), len(blue[0].faces)) == (2, 1)
     np.testing.assert_allclose(red[1].base_color, [0.5, 0, 0])
@@ -169,9 +170,9 @@ def test_ply_vertex_colours(tmp_path: Path, encoding: str) -> None:
 
 def test_ply_big_endian_polygons_of_several_sizes(tmp_path: Path) -> None:
     header = (
-        "ply\nformat binary_big_endian 1.0\ncomment made by hand\nelement vertex 5\nproperty double x\nproperty double y\n"
-        "property double z\nproperty float quality\nelement face 2\nproperty list uchar int vertex_indices\n"
-        "property uchar flags\nend_header\n"
+        "ply\nformat binary_big_endian 1.0\ncomment made by hand\nelement vertex 5\nproperty double x\n"
+        "property double y\nproperty double z\nproperty float quality\nelement face 2\n"
+        "property list uchar int vertex_indices\nproperty uchar flags\nend_header\n"
     )
     points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0)]
     body = b"".join(struct.pack(">dddf", *point, 0.5) for point in points)

@@ -1,6 +1,8 @@
 """glTF objects: axes, sizes, transforms, normals and materials."""
 
 import io
+import time
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from PIL import Image
 from illuminerf.cues.materials import Parts
 from illuminerf.cues.object_files import MissingMaterials, ObjectReading, load_object
 from illuminerf.cues.raw_objects import ReadingLimits
+from illuminerf.cues.texture_baking import baked
 from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.workflow.errors import UserError
 from tests.cues.made_objects import FACES, TETRAHEDRON, UV, Gltf, png
@@ -252,7 +255,7 @@ def test_nothing_but_geometry_gets_a_random_material(tmp_path: Path) -> None:
     assert mix.min() < 0.1 and mix.max() > 0.9
     narrow = MissingMaterials(min_albedo=0.3, max_albedo=0.4, min_roughness=0.1, max_roughness=0.1, max_mix=0.0)
     material = load(path, missing=narrow)[0][1]
-    assert 0.3 <= min(material.base_color) and max(material.base_color) <= 0.4
+    assert min(material.base_color) >= 0.3 and max(material.base_color) <= 0.4
     assert (material.roughness, material.metallic) == (pytest.approx(0.1), 0)
 
 
@@ -338,3 +341,27 @@ def test_settings_are_checked() -> None:
         MissingMaterials(min_roughness=0.6)
     with pytest.raises(UserError, match="limits"):
         ReadingLimits(max_faces=0)
+
+
+@pytest.mark.slow
+def test_a_million_faces_in_bounded_time_and_memory(tmp_path: Path) -> None:
+    """A textured, normal-mapped ball of a million faces is read and baked; measured: 9 s, 1.3 GB beyond the start."""
+    side = 708
+    azimuth, polar = np.meshgrid(np.linspace(0, 2 * np.pi, side), np.linspace(0.01, np.pi - 0.01, side))
+    ball = np.stack([np.cos(azimuth) * np.sin(polar), np.cos(polar), np.sin(azimuth) * np.sin(polar)], -1)
+    uv = np.stack([azimuth / (2 * np.pi), polar / np.pi], -1).reshape(-1, 2).astype(np.float32)
+    index = np.arange(side * side).reshape(side, side)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+    gltf = Gltf()
+    pbr = {"baseColorTexture": gltf.texture(png((9, 99, 200), 512))}
+    material = {"pbrMetallicRoughness": pbr, "normalTexture": gltf.texture(png((128, 128, 255), 512))}
+    path = gltf.mesh(ball.reshape(-1, 3), faces, material, TEXCOORD_0=uv).glb(tmp_path / "a.glb")
+    tracemalloc.start()
+    start = time.monotonic()
+    ((mesh, made),) = baked(load(path))
+    seconds, peak = time.monotonic() - start, tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(mesh.faces) == len(faces) > 999_000 and not made.is_textured
+    np.testing.assert_allclose(mesh.vertex_normals, mesh.vertices, atol=0.02)
+    assert seconds < 120 and peak < 2e9

@@ -162,7 +162,12 @@ def _shape(mesh: TriangleMesh, material: Material, device: str, unlit: bool = Fa
         names = ("vertex_color", "vertex_roughness", "vertex_metallic")
         attributes = dict(zip(names, material.per_vertex(len(mesh.vertices)), strict=True))
         sources = [{"type": "mesh_attribute", "name": name} for name in names]
-    bsdf = {"type": "principled", "base_color": sources[0], "roughness": sources[1], "metallic": sources[2]}
+    bsdf: dict[str, Any] = {
+        "type": "principled",
+        "base_color": sources[0],
+        "roughness": sources[1],
+        "metallic": sources[2],
+    }
     if unlit:
         bsdf = {"type": "diffuse", "reflectance": sources[0]}
     elif material.normal_map is not None:
