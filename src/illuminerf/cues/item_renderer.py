@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from illuminerf.cues.gltf_objects import Parts
+from illuminerf.cues.materials import Parts
 from illuminerf.cues.renderer import CueSampling, MitsubaCueRenderer
 from illuminerf.cues.shading import ShadedScene, concatenated
 from illuminerf.cues.texture_baking import baked

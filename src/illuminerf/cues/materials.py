@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.workflow.errors import UserError
 
 
@@ -16,12 +17,15 @@ class Material:
         roughness: in [0, 1], alpha = roughness^2: a number, per vertex [V], or an image [h, w].
         metallic: in [0, 1]: a number, per vertex [V], or an image [h, w].
         uv: float32 [V, 2], v = 0 at the bottom row of the images; only with images.
+        normal_map: image [h, w, 3] of the same size of unit shading normals in the tangent frame (x along +u, y along
+            +v, that is OpenGL's "green up", z outward), or None. Only with images.
     """
 
     base_color: np.ndarray | tuple[float, float, float] = (0.8, 0.8, 0.8)
     roughness: np.ndarray | float = 0.5
     metallic: np.ndarray | float = 0.0
     uv: np.ndarray | None = None
+    normal_map: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name, value in (
@@ -34,6 +38,12 @@ class Material:
                 raise UserError(f"a material's {name} is out of range", wanted="values in [0, 1]")
         if (self.uv is None) == self.is_textured:
             raise UserError("a material needs uv coordinates exactly where it has images")
+        if self.normal_map is not None and self.normal_map.shape != np.asarray(self.base_color).shape:
+            raise UserError(
+                "a normal map needs the size of the base colour's image",
+                got=str(self.normal_map.shape),
+                wanted=str(np.asarray(self.base_color).shape),
+            )
 
     @property
     def is_textured(self) -> bool:
@@ -57,3 +67,7 @@ class Material:
             for value in (self.roughness, self.metallic)
         )
         return (color, *scalars)  # type: ignore[return-value]
+
+
+Parts = list[tuple[TriangleMesh, Material]]
+"""An object: meshes in one frame, each with its material."""

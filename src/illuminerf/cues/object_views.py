@@ -12,9 +12,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from illuminerf.cues.gltf_objects import Parts, load_object
+from illuminerf.cues.broken_object import BrokenObject
 from illuminerf.cues.item_renderer import ItemRenderer, MitsubaItemRenderer
 from illuminerf.cues.light_library import load_light
+from illuminerf.cues.materials import Parts
+from illuminerf.cues.object_files import ObjectReading, load_object
 from illuminerf.cues.renderer import CueSampling
 from illuminerf.cues.training_cameras import CameraSphere, draw_camera
 from illuminerf.cues.training_lights import LightVariation, draw_light
@@ -50,6 +52,8 @@ class ViewSettings:
     """How objects are varied."""
     light_height: int = 256
     """Rows that all maps are brought to."""
+    reading: ObjectReading = field(default_factory=ObjectReading)
+    """How object files are read, and what those without materials are made of."""
     bakes_textures: bool = True
     """Move textures onto vertices, which saves compiling kernels; turn off above 128 pixels."""
     renderer: Literal["mitsuba", "blender"] = "mitsuba"
@@ -104,9 +108,9 @@ def render_views(
     """
     item = objects[index]
     try:
-        parts = _loaded(item, settings.seed)
-    except UserError as error:
-        yield from ((view, LeftOut(_reason(error), str(error))) for view in views)
+        parts = _loaded(item, settings.seed, settings.reading)
+    except BrokenObject as error:
+        yield from ((view, LeftOut(error.reason, str(error))) for view in views)
         return
     for view in views:
         try:
@@ -116,13 +120,9 @@ def render_views(
             yield view, LeftOut("not rendered", f"{type(error).__name__}: {error}".splitlines()[0])
 
 
-def _reason(error: UserError) -> str:
-    return str(getattr(error, "reason", "unusable"))
-
-
 @functools.lru_cache(maxsize=_OBJECTS_IN_MEMORY)
-def _loaded(item: ObjectFile, seed: int) -> Parts:
-    return load_object(Path(item.path), numpy_generator(seed, "object", item.id))
+def _loaded(item: ObjectFile, seed: int, reading: ObjectReading) -> Parts:
+    return load_object(Path(item.path), numpy_generator(seed, "object", item.id), reading)
 
 
 def _rendered(
@@ -138,8 +138,8 @@ def _rendered(
         if other.id == item.id:
             return None
         try:
-            found = _loaded(other, settings.seed)
-        except UserError:
+            found = _loaded(other, settings.seed, settings.reading)
+        except BrokenObject:
             return None
         used[other.id] = other
         return other.id, found

@@ -1,12 +1,14 @@
 """Renderings of objects with metallic-roughness materials: training targets and made-up captures."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from illuminerf.cues.materials import Material
+from illuminerf.cues.materials import Material, Parts
 from illuminerf.cues.mitsuba_scene import MitsubaScene, mitsuba_mesh
 from illuminerf.cues.mitsuba_variant import load_mitsuba
+from illuminerf.cues.texture_baking import is_uv_mirrored
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import srgb_from_linear
@@ -27,7 +29,7 @@ class ShadedScene:
         device: "auto", "cpu" or "cuda".
     """
 
-    def __init__(self, parts: list[tuple[TriangleMesh, Material]], light: EnvironmentMap, device: str = "auto") -> None:
+    def __init__(self, parts: Parts, light: EnvironmentMap, device: str = "auto") -> None:
         self._parts, self._first_light, self._device = _merged(parts), light, device
         shapes = {f"part{i}": _shape(mesh, material, device) for i, (mesh, material) in enumerate(self._parts)}
         self._scene = MitsubaScene(shapes, light, device)
@@ -43,23 +45,43 @@ class ShadedScene:
         return self._scene.render(cameras, view, _PATH_DEPTH, samples_per_pixel, seed)
 
     def properties(self, cameras: Cameras, view: int) -> dict[str, np.ndarray]:
-        """What the surface is, without light: base_color [h, w, 3] linear, roughness and metallic [h, w] and the
-        world-space shading normal [h, w, 3] turned towards the camera. 0 where nothing is seen; all but the unit
-        normal are premultiplied by coverage [h, w]."""
+        """What the surface is, without light.
+
+        Returns:
+            base_color [h, w, 3] linear, roughness and metallic [h, w], premultiplied by coverage [h, w], and normal
+            [h, w, 3], the unit shading normal in the world, normal maps included, turned towards the camera. 0 where
+            nothing is seen.
+        """
         shapes = {
             f"part{i}": _shape(mesh, material, self._device, unlit=True)
             for i, (mesh, material) in enumerate(self._parts)
         }
         scene = MitsubaScene(shapes, EnvironmentMap(np.ones((2, 4, 3), np.float32)), self._device)
-        first = scene.render_aovs("color:albedo,normal:sh_normal,depth:depth", cameras, view, _PROPERTY_SAMPLES, 0)
+        first = scene.render_aovs(
+            "color:albedo,normal:sh_normal,depth:depth,tangent:dp_du", cameras, view, _PROPERTY_SAMPLES, 0
+        )
         for index, (mesh, material) in enumerate(self._parts):
-            _show_other_properties(scene, f"part{index}", mesh, material)
+            _, roughness, metallic = _arrays(mesh, material)
+            packed = np.concatenate([roughness, metallic, np.ones_like(roughness)], -1)
+            _show(scene, f"part{index}", material.is_textured, packed)
         second = scene.render_aovs("other:albedo", cameras, view, _PROPERTY_SAMPLES, 0)
-        return _unpacked(first, second, cameras, view)
+        found = _unpacked(first, second)
+        if any(material.normal_map is not None for _, material in self._parts):
+            for index, (mesh, material) in enumerate(self._parts):
+                mapped = material.normal_map
+                if mapped is None:
+                    mapped = np.broadcast_to(np.array([0, 0, 1], np.float32), _arrays(mesh, material)[0].shape)
+                _show(scene, f"part{index}", material.is_textured, mapped / 2 + 0.5)
+            third = scene.render_aovs("mapped:albedo", cameras, view, _PROPERTY_SAMPLES, 0)
+            found["normal"] = _bent(found["normal"], first[..., 7:10], third[..., :3], found["coverage"])
+        _, directions = cameras.image_rays(view)
+        away = (found["normal"] * directions.numpy()).sum(-1, keepdims=True) > 0
+        found["normal"] = np.where(away, -found["normal"], found["normal"]).astype(np.float32)
+        return found
 
 
 def render_shaded(
-    parts: list[tuple[TriangleMesh, Material]],
+    parts: Parts,
     cameras: Cameras,
     light: EnvironmentMap,
     samples_per_pixel: int = 64,
@@ -101,16 +123,30 @@ def concatenated(meshes: list[TriangleMesh]) -> TriangleMesh:
     )
 
 
-def _merged(parts: list[tuple[TriangleMesh, Material]]) -> list[tuple[TriangleMesh, Material]]:
+def _merged(parts: Parts) -> Parts:
     """Untextured parts become one mesh with per-vertex values: fewer shapes, so fewer kernels to compile."""
     plain = [(mesh, material) for mesh, material in parts if not material.is_textured]
-    textured = [(mesh, material) for mesh, material in parts if material.is_textured]
+    textured = [piece for part in parts if part[1].is_textured for piece in _unmirrored(*part)]
     if not plain:
         return textured
     values = [material.per_vertex(len(mesh.vertices)) for mesh, material in plain]
     color, roughness, metallic = (np.concatenate(arrays) for arrays in zip(*values, strict=True))
     merged = Material(color, roughness[:, 0], metallic[:, 0])
     return [(concatenated([mesh for mesh, _ in plain]), merged), *textured]
+
+
+def _unmirrored(mesh: TriangleMesh, material: Material) -> Parts:
+    """Mitsuba takes +v along normal x tangent: faces that show the picture mirrored need a normal map of their own."""
+    if material.normal_map is None:
+        return [(mesh, material)]
+    assert material.uv is not None
+    is_mirrored = is_uv_mirrored(mesh, material.uv)
+    flipped = replace(material, normal_map=material.normal_map * np.array([1, -1, 1], np.float32))
+    return [
+        (TriangleMesh(mesh.vertices, np.ascontiguousarray(mesh.faces[chosen]), mesh.vertex_normals), of_side)
+        for chosen, of_side in ((~is_mirrored, material), (is_mirrored, flipped))
+        if chosen.any()
+    ]
 
 
 def _shape(mesh: TriangleMesh, material: Material, device: str, unlit: bool = False) -> Any:
@@ -126,34 +162,56 @@ def _shape(mesh: TriangleMesh, material: Material, device: str, unlit: bool = Fa
         names = ("vertex_color", "vertex_roughness", "vertex_metallic")
         attributes = dict(zip(names, material.per_vertex(len(mesh.vertices)), strict=True))
         sources = [{"type": "mesh_attribute", "name": name} for name in names]
-    bsdf = {"type": "principled", "base_color": sources[0], "roughness": sources[1], "metallic": sources[2]}
+    bsdf: dict[str, Any] = {
+        "type": "principled",
+        "base_color": sources[0],
+        "roughness": sources[1],
+        "metallic": sources[2],
+    }
     if unlit:
         bsdf = {"type": "diffuse", "reflectance": sources[0]}
+    elif material.normal_map is not None:
+        coded = mi.Bitmap(np.array(material.normal_map / 2 + 0.5, np.float32, order="C"))
+        bsdf = {
+            "type": "normalmap",
+            "normalmap": {"type": "bitmap", "bitmap": coded, "raw": True},
+            # darkens what tilts away from the face; smooth vertex normals, ours and Blender's, have no such term
+            "use_shadowing_function": False,
+            "bsdf": bsdf,
+        }
     two_sided = {"type": "twosided", "front": bsdf}
     return mitsuba_mesh(mi, "part", mesh.vertices, mesh.faces, two_sided, mesh.vertex_normals, material.uv, attributes)
 
 
-def _show_other_properties(scene: MitsubaScene, shape: str, mesh: TriangleMesh, material: Material) -> None:
-    """Exchange the albedo of an unlit shape for (roughness, metallic, 1)."""
-    arrays = material.images() if material.is_textured else material.per_vertex(len(mesh.vertices))
-    packed = np.concatenate([arrays[1], arrays[2], np.ones_like(arrays[1])], -1).astype(np.float32)
-    ending = "reflectance.data" if material.is_textured else "vertex_color"
+def _arrays(mesh: TriangleMesh, material: Material) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Base colour, roughness and metallic as images or per vertex, the last two with one channel."""
+    return material.images() if material.is_textured else material.per_vertex(len(mesh.vertices))
+
+
+def _show(scene: MitsubaScene, shape: str, is_textured: bool, values: np.ndarray) -> None:
+    """Exchange the albedo of an unlit shape for other values, an image [h, w, 3] or per vertex [V, 3]."""
+    ending = "reflectance.data" if is_textured else "vertex_color"
     name = next(n for n in scene.parameters.keys() if n.startswith(f"{shape}.") and n.endswith(ending))  # noqa: SIM118
-    values = scene.mitsuba.TensorXf(packed) if material.is_textured else packed.ravel()
-    scene.set_values(**{name.replace(".", "__"): values})
+    values = np.ascontiguousarray(values, np.float32)
+    scene.set_values(**{name.replace(".", "__"): scene.mitsuba.TensorXf(values) if is_textured else values.ravel()})
 
 
-def _unpacked(first: np.ndarray, second: np.ndarray, cameras: Cameras, view: int) -> dict[str, np.ndarray]:
-    color, normal = first[..., :3], first[..., 3:6]
+def _unpacked(first: np.ndarray, second: np.ndarray) -> dict[str, np.ndarray]:
+    normal = first[..., 3:6]
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    hit = first[..., 6:7] > 0
-    normal = np.where(hit, normal / np.maximum(length, 1e-6), 0)
-    _, directions = cameras.image_rays(view)
-    away = (normal * directions.numpy()).sum(-1, keepdims=True) > 0
     return {
-        "base_color": color,
+        "base_color": first[..., :3],
         "roughness": second[..., 0],
         "metallic": second[..., 1],
         "coverage": second[..., 2],
-        "normal": np.where(away, -normal, normal).astype(np.float32),
+        "normal": np.where(first[..., 6:7] > 0, normal / np.maximum(length, 1e-6), 0),
     }
+
+
+def _bent(normal: np.ndarray, tangent: np.ndarray, coded: np.ndarray, coverage: np.ndarray) -> np.ndarray:
+    """Interpolated normals [h, w, 3] bent by tangent-space ones, coded as (n + 1) / 2 times coverage [h, w]."""
+    mapped = 2 * coded / np.maximum(coverage, 1e-3)[..., None] - 1
+    tangent = tangent - normal * (normal * tangent).sum(-1, keepdims=True)
+    tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-12)
+    bent = tangent * mapped[..., :1] + np.cross(normal, tangent) * mapped[..., 1:2] + normal * mapped[..., 2:]
+    return np.where(coverage[..., None] > 0, bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-6), 0)

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from illuminerf.cues.gltf_objects import Parts
-from illuminerf.cues.materials import Material
+from illuminerf.cues.materials import Material, Parts
 from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.workflow.errors import UserError
 
@@ -120,6 +119,7 @@ def _replaced(
         material.roughness if new_roughness is None else new_roughness,
         material.metallic if new_metallic is None else new_metallic,
         material.uv,
+        material.normal_map,
     )
 
 
