@@ -11,6 +11,8 @@ from typing import Annotated, Any, ClassVar
 import tyro
 
 from illuminerf import benchmark, demo, pipeline
+from illuminerf.data.objaverse_download import download_objaverse
+from illuminerf.data.object_collection import read_ids
 from illuminerf.presets import PRESETS, Preset, customised
 from illuminerf.stages import (
     estimate_geometry,
@@ -31,6 +33,7 @@ from illuminerf.workflow.task_pool import Execution
 
 PositionalPath = Annotated[Path, tyro.conf.Positional]
 _DEFAULT_PAIRS = render_training_pairs.Config()
+_PAPER_PAIRS = render_training_pairs.Config.paper()
 _DEFAULT_PREVIEW = preview_training_pairs.Config()
 _ALL_CORES = Execution(workers=os.cpu_count() or 1)
 
@@ -100,7 +103,7 @@ def render_training_pairs_command(
     """Render objects under several lights, with cues: what a relighting model learns from.
 
     Args:
-        objects: Folder of model files.
+        objects: Folder of .glb, .gltf, .obj and .ply files, an Objaverse folder, or a list of Objaverse ids.
         lights: Folder of .exr or .hdr environment maps.
         out: Folder or fsspec URL; run the same command again to go on after an interruption.
         config: What is rendered.
@@ -108,6 +111,25 @@ def render_training_pairs_command(
     """
     render_training_pairs.run(objects, lights, config, out, execution)
     say(f"done: {out}")
+
+
+def render_paper_pairs_command(
+    objects: PositionalPath,
+    lights: PositionalPath,
+    out: str,
+    config: Annotated[render_training_pairs.Config, tyro.conf.arg(name="")] = _PAPER_PAIRS,
+    execution: Annotated[Execution, tyro.conf.arg(name="")] = _ALL_CORES,
+) -> None:
+    """The same as render-training-pairs, with the paper's numbers as defaults (512 x 512, 512 samples per pixel).
+
+    Args:
+        objects: Folder of .glb, .gltf, .obj and .ply files, an Objaverse folder, or a list of Objaverse ids.
+        lights: Folder of .exr or .hdr environment maps.
+        out: Folder or fsspec URL; run the same command again to go on after an interruption.
+        config: What is rendered.
+        execution: Where.
+    """
+    render_training_pairs_command(objects, lights, out, config, execution)
 
 
 def preview_command(
@@ -124,6 +146,21 @@ def preview_command(
     """
     preview_training_pairs.run(pairs, config, out)
     say(f"done: {out}")
+
+
+def download_objaverse_command(
+    ids: PositionalPath, root: PositionalPath, first: int | None = None, processes: int = 4
+) -> None:
+    """Download objects of Objaverse with the `objaverse` package; what is there is not fetched again.
+
+    Args:
+        ids: File of ids: a JSON list, a CSV with a column uid, or one id a line.
+        root: Folder that gets hf-objaverse-v1; render-training-pairs takes it as OBJECTS.
+        first: Only so many ids from the start of the list.
+        processes: Parallel downloads.
+    """
+    paths = download_objaverse(read_ids(ids)[:first], root, processes)
+    say(f"done: {len(paths)} objects in {root}")
 
 
 class StageCall:
@@ -197,6 +234,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
         {"novel_views": Path, "truth": Path},
     ),
     "render-training-pairs": render_training_pairs_command,
+    "render-paper-pairs": render_paper_pairs_command,
     "train-rdm": _stage(
         train_relighting_model.run,
         train_relighting_model.Config,
@@ -210,7 +248,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 }
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
     "benchmark": {"tensoir": benchmark.tensoir_command},
-    "data": {"preview": preview_command},
+    "data": {"preview": preview_command, "download-objaverse": download_objaverse_command},
 }
 
 

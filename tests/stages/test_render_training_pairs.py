@@ -13,6 +13,7 @@ from illuminerf.cues import training_shards
 from illuminerf.cues.object_views import ViewSettings
 from illuminerf.cues.renderer import CueSampling
 from illuminerf.cues.variations import MaterialVariation
+from illuminerf.data.object_collection import ObjectChoice
 from illuminerf.diffusion.training_items import load_items
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.environment import EnvironmentMap
@@ -94,7 +95,9 @@ def test_items_hold_what_training_needs(assets: tuple[Path, Path], tmp_path: Pat
 def test_a_diffuse_object_is_albedo_times_its_cue(assets: tuple[Path, Path], tmp_path: Path) -> None:
     """Targets and cues are made separately, so agreement holds axes, light and exposure together."""
     views = replace(VIEWS, num_views=1, samples_per_pixel=64, cue_sampling=CueSampling(64))
-    config = Config(replace(views, materials=MaterialVariation.none()), excluded=("cube", "cone", "broken"))
+    config = Config(
+        replace(views, materials=MaterialVariation.none()), choice=ObjectChoice(excluded=("cube", "cone", "broken"))
+    )
     write_object(assets[0], "ball", trimesh.creation.icosphere(3), roughnessFactor=1.0, metallicFactor=0.0)
     render_training_pairs.run(*assets, config, tmp_path / "pairs")
     ((_, arrays, _),) = iterate_items(tmp_path / "pairs")
@@ -188,7 +191,7 @@ def test_unusable_lights_are_left_out_by_name(assets: tuple[Path, Path], tmp_pat
 
     for name, image in (("tiny", np.ones((1, 1), np.float32)), ("hole", np.full((8, 16), np.nan, np.float32))):
         write_exr(assets[1] / f"{name}.exr", dict.fromkeys("RGB", image))
-    config = replace(CONFIG, excluded=("broken", "cone", "cube"))
+    config = replace(CONFIG, choice=ObjectChoice(excluded=("broken", "cone", "cube")))
     render_training_pairs.run(*assets, config, tmp_path / "pairs")
     manifest = read_json(tmp_path / "pairs" / "manifest.json")
     assert sorted(manifest["lights_left_out"]) == ["hole", "tiny"] and manifest["lights"] == ["dusk", "night", "noon"]
@@ -196,7 +199,7 @@ def test_unusable_lights_are_left_out_by_name(assets: tuple[Path, Path], tmp_pat
 
 def test_wrong_inputs_are_explained(assets: tuple[Path, Path], tmp_path: Path) -> None:
     run = render_training_pairs.run
-    with pytest.raises(UserError, match="no objects"):
+    with pytest.raises(UserError, match="holds no objects"):
         run(assets[1], assets[1], CONFIG, tmp_path / "a")
     with pytest.raises(UserError, match="too few lights"):
         run(*assets, replace(CONFIG, views=replace(VIEWS, num_lights=4)), tmp_path / "b")
@@ -208,7 +211,7 @@ def test_wrong_inputs_are_explained(assets: tuple[Path, Path], tmp_path: Path) -
     (tmp_path / "c" / "thesis.txt").write_text("mine")
     with pytest.raises(UserError, match="not a run of this program"):
         run(*assets, CONFIG, tmp_path / "c")
-    config = replace(CONFIG, excluded=("broken", "cone", "cube"))
+    config = replace(CONFIG, choice=ObjectChoice(excluded=("broken", "cone", "cube")))
     run(*assets, config, tmp_path / "d")
     with pytest.raises(UserError, match="views.seed is 0 there and 3 here"):
         run(*assets, replace(config, views=replace(VIEWS, seed=3)), tmp_path / "d")

@@ -69,6 +69,19 @@ class ViewSettings:
         if self.light_height < 8:
             raise UserError("light_height is too small", got=str(self.light_height), wanted="8 or more")
 
+    @staticmethod
+    def paper() -> "ViewSettings":
+        """The paper's numbers (supplement, "Training Data Processing"); what it leaves open is as by default."""
+        return ViewSettings(
+            size=512,
+            samples_per_pixel=512,
+            cue_sampling=CueSampling(samples_per_pixel=512),
+            cameras=CameraSphere.paper(),
+            materials=MaterialVariation.none(),
+            light_height=512,
+            bakes_textures=False,
+        )
+
     def item_renderer(self) -> ItemRenderer:
         """The path tracer."""
         return MitsubaItemRenderer(self.samples_per_pixel, self.cue_sampling, self.bakes_textures)

@@ -28,6 +28,7 @@ from illuminerf.cues.training_shards import (
     pack_shard,
     render_object,
 )
+from illuminerf.data.object_collection import ObjectChoice, list_objects
 from illuminerf.workflow.artefact import fingerprint, locked, provenance, refuse_other_key
 from illuminerf.workflow.config import to_json
 from illuminerf.workflow.device import numpy_generator
@@ -49,12 +50,17 @@ class Config:
     """What is rendered of each object."""
     objects_per_shard: int = 16
     """Objects whose views share one shard."""
-    excluded: tuple[str, ...] = ()
-    """Objects to leave out by id, for reasons seen by eye."""
+    choice: ObjectChoice = field(default_factory=ObjectChoice)
+    """Which objects of the collection are taken."""
 
     def __post_init__(self) -> None:
         if self.objects_per_shard < 1:
             raise UserError("objects_per_shard must be at least 1")
+
+    @staticmethod
+    def paper() -> "Config":
+        """The paper's numbers: 4 views of 512 x 512 at 512 samples, objects as they are."""
+        return Config(ViewSettings.paper(), objects_per_shard=8)
 
 
 def run(objects: Path, lights: Path, config: Config, out: str | Path, execution: Execution | None = None) -> str | Path:
@@ -62,7 +68,7 @@ def run(objects: Path, lights: Path, config: Config, out: str | Path, execution:
     reason, and never replaced by others.
 
     Args:
-        objects: a folder of model files.
+        objects: a folder of model files, an Objaverse folder, or a list of Objaverse ids (`data.object_collection`).
         lights: a folder of .exr or .hdr environment maps.
         config: the settings.
         out: a folder or an fsspec URL.
@@ -73,12 +79,11 @@ def run(objects: Path, lights: Path, config: Config, out: str | Path, execution:
     """
     execution = execution or Execution()
     storage = Storage(out)
-    collection = _objects(objects)
+    collection = _objects(objects, config.choice)
     usable, unusable_lights = _usable_lights(lights, config.views)
-    chosen = [item for item in collection if item.id not in config.excluded]
-    order = numpy_generator(config.views.seed, "order of objects").permutation(len(chosen))
+    order = numpy_generator(config.views.seed, "order of objects").permutation(len(collection))
     plan = Plan(
-        tuple(chosen[i] for i in order), tuple(str(path) for path in usable), config.views, config.objects_per_shard
+        tuple(collection[i] for i in order), tuple(str(path) for path in usable), config.views, config.objects_per_shard
     )
     key = {"schema": SCHEMA, "stage": STAGE, "config": to_json(config)}
     made_from = {"objects": _collection_digest(collection), "lights": fingerprint(lights)}
@@ -100,13 +105,16 @@ def run(objects: Path, lights: Path, config: Config, out: str | Path, execution:
     return out
 
 
-def _objects(folder: Path) -> list[ObjectFile]:
-    if not folder.is_dir():
-        raise UserError(f"{folder} does not exist", wanted="a folder of model files")
-    paths = sorted(folder.glob("*.glb"))
-    if not paths:
-        raise UserError(f"{folder} holds no objects", wanted=".glb files")
-    return [ObjectFile(path.stem, str(path)) for path in paths]
+def _objects(source: Path, choice: ObjectChoice) -> list[ObjectFile]:
+    """The collection, with ids that may be keys of samples: a dot would end a key."""
+    found, taken = [], set()
+    for item in list_objects(source, choice):
+        identity = item.id.replace(".", "-")
+        while identity in taken:
+            identity += "-"
+        taken.add(identity)
+        found.append(ObjectFile(identity, str(item.path), item.licence))
+    return found
 
 
 def _collection_digest(collection: list[ObjectFile]) -> str:
@@ -248,7 +256,7 @@ def _manifest(
             name: {"sha256": index.sha256, "num_bytes": index.num_bytes, "num_items": len(index.keys)}
             for name, index in sorted(shards.items())
         },
-        "excluded": sorted(config.excluded),
+        "excluded": sorted(config.choice.excluded),
         "left_out": {key: to_json(why) for key, why in sorted(left_out.items())},
         "left_out_by_reason": dict(sorted(Counter(why.reason for why in left_out.values()).items())),
         "lights": sorted(Path(path).stem for path in plan.lights),
