@@ -40,6 +40,8 @@ def main(folder: Path) -> None:
     layer = scene.view_layers[0]
     for rendering in job["renderings"]:
         environment.image = lights[rendering["light"]]
+        # how finely Cycles importance-samples the light; left to itself it takes a second per picture for that
+        scene.world.cycles.sample_map_resolution = min(max(environment.image.size[0], 64), 8192)
         layer.material_override = {"own": None, "diffuse": diffuse, "glossy": glossy}[rendering["material"]]
         lobe.inputs["Roughness"].default_value = rendering["roughness"]
         is_flat = rendering["material"] == "diffuse"
@@ -118,6 +120,7 @@ def set_up_camera(scene: Any, camera: dict[str, Any]) -> None:
 def set_up_world(scene: Any, light: Any) -> Any:
     """An environment light in our axes, which are Blender's without a rotation; returns the node of its image."""
     scene.world = bpy.data.worlds.new("light")
+    scene.world.cycles.sampling_method = "MANUAL"
     tree = cleared(scene.world)
     environment = tree.nodes.new("ShaderNodeTexEnvironment")
     environment.projection, environment.interpolation, environment.image = "EQUIRECTANGULAR", "Linear", light
