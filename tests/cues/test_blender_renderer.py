@@ -185,6 +185,7 @@ def test_absent_blender_is_explained(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         ("sys.stderr.write('out of memory\\n'); sys.exit(3)", "status 3; got out of memory"),
         ("sys.exit(\"ModuleNotFoundError: No module named 'bpy'\")", r"illuminerf\[blender\]"),
         ("sys.exit('ImportError: libSM.so.6: cannot open shared object file')", "apt install"),
+        ("print('Error: Python: line 1'); sys.exit(1)", "status 1; got Error: Python: line 1"),
         ("sys.stderr.write('lost interest\\n')", "without the picture target_0; got lost interest"),
     ],
 )

@@ -74,7 +74,7 @@ class BlenderItemRenderer:
         with tempfile.TemporaryDirectory(prefix="illuminerf-blender-") as name:
             folder = Path(name)
             write_job(folder, parts, camera, lights, renderings, self.denoises, device)
-            run_blender(worker_command(self.executable, folder), folder / "stderr.txt", self.timeout_seconds)
+            run_blender(worker_command(self.executable, folder), folder / "log.txt", self.timeout_seconds)
             images = {r.name: _picture(folder, r.name, camera) for r in renderings}
         planes = {key: image.transpose(2, 0, 1) for key, image in images.items()}
         targets = [planes[f"target_{i}"][:3] for i in range(len(lights))]
@@ -125,16 +125,16 @@ def worker_command(executable: str, folder: Path) -> list[str]:
     return [found, *options, "--", str(folder)]
 
 
-def run_blender(command: list[str], stderr_file: Path, timeout_seconds: float) -> None:
-    """Run a command to its end, its complaints in a file.
+def run_blender(command: list[str], log_file: Path, timeout_seconds: float) -> None:
+    """Run a command to its end, what it says in a file: the blender program complains on stdout, bpy on stderr.
 
     Raises:
         UserError: it does not start, fails or runs out of time.
     """
     try:
-        with stderr_file.open("wb") as stderr:
+        with log_file.open("wb") as log:
             process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr, start_new_session=True
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
             )
     except OSError as error:
         raise UserError("Blender does not start", got=str(error), fix=_INSTALL) from error
@@ -143,7 +143,7 @@ def run_blender(command: list[str], stderr_file: Path, timeout_seconds: float) -
     except subprocess.TimeoutExpired as error:
         raise UserError(
             f"Blender did not finish one item in {timeout_seconds:g} s",
-            got=_last_lines(stderr_file),
+            got=_last_lines(log_file),
             fix="use fewer samples or pixels, or a longer timeout_seconds",
         ) from error
     finally:
@@ -152,21 +152,21 @@ def run_blender(command: list[str], stderr_file: Path, timeout_seconds: float) -
                 os.killpg(process.pid, signal.SIGKILL)  # whatever it started goes with it
             process.wait()
     if status != 0:
-        complaints = _last_lines(stderr_file)
+        words = _last_lines(log_file)
         fix = ""
-        if "No module named 'bpy'" in complaints:
+        if "No module named 'bpy'" in words:
             fix = _INSTALL
-        elif ".so" in complaints and ("cannot open shared object" in complaints or "shared libraries" in complaints):
+        elif ".so" in words and ("cannot open shared object" in words or "shared libraries" in words):
             fix = f"install the system libraries that Blender needs (Debian, Ubuntu: {_SYSTEM_LIBRARIES})"
-        raise UserError(f"Blender failed with status {status}", got=complaints, fix=fix)
+        raise UserError(f"Blender failed with status {status}", got=words, fix=fix)
 
 
 def _picture(folder: Path, name: str, camera: Cameras) -> np.ndarray:
     if not (folder / f"{name}.exr").is_file():  # Blender may leave with status 0 all the same
-        raise UserError(f"Blender ended without the picture {name}", got=_last_lines(folder / "stderr.txt"))
+        raise UserError(f"Blender ended without the picture {name}", got=_last_lines(folder / "log.txt"))
     return read_rendering(folder, name, camera)
 
 
 def _last_lines(path: Path) -> str:
     lines = [line.strip() for line in path.read_text(errors="replace").splitlines() if line.strip()]
-    return " | ".join(lines[-_LAST_LINES:]) or "no complaint"
+    return " | ".join(lines[-_LAST_LINES:]) or "not a word"

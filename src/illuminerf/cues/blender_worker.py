@@ -1,7 +1,7 @@
 """The part that runs inside Blender: reads a job folder (`blender_job`) and writes its pictures.
 
 Run by its path, by a Python that has the module `bpy` or by the program `blender`; of the folder's files it needs to
-know only their names, and of Python only numpy:
+know only their names, and of Python only numpy. Blender 3.4 to 5.3 are known to work.
 
     python blender_worker.py FOLDER
     blender --background --factory-startup --python-exit-code 1 --python blender_worker.py -- FOLDER
@@ -17,7 +17,7 @@ import numpy as np
 from mathutils import Matrix
 
 _SENSOR_MILLIMETRES = 36.0
-_LINEAR, _RAW = "Linear Rec.709", "Non-Color"
+_LINEAR, _RAW = "Linear Rec.709" if bpy.app.version >= (4, 0) else "Linear", "Non-Color"
 
 
 def main(folder: Path) -> None:
@@ -74,11 +74,12 @@ def set_up_cycles(scene: Any, job: dict[str, Any]) -> None:
     scene.view_settings.view_transform, scene.view_settings.look = "Raw", "None"
     scene.view_settings.exposure, scene.view_settings.gamma = 0, 1
     cycles.use_adaptive_sampling = False
-    cycles.sampling_pattern = "TABULATED_SOBOL"
+    if bpy.app.version >= (3, 5):  # the only pattern in all releases since
+        cycles.sampling_pattern, cycles.use_light_tree = "TABULATED_SOBOL", False
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0
     cycles.blur_glossy = cycles.light_sampling_threshold = 0
     cycles.caustics_reflective = True
-    cycles.use_light_tree = cycles.use_guiding = cycles.use_fast_gi = False
+    cycles.use_guiding = cycles.use_fast_gi = False
     cycles.pixel_filter_type = "BOX"
     cycles.use_denoising = job["denoises"]
     if job["denoises"]:
@@ -149,10 +150,12 @@ def add_object(scene: Any, arrays: dict[str, np.ndarray], index: int, material: 
     mesh.loops.foreach_set("vertex_index", faces.ravel())
     mesh.polygons.add(len(faces))
     mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, 3, dtype=np.int32))
+    if bpy.app.version < (3, 6):  # later ones see it from loop_start
+        mesh.polygons.foreach_set("loop_total", np.full(len(faces), 3, np.int32))
     mesh.polygons.foreach_set("use_smooth", np.full(len(faces), is_smooth))
     if f"uv_{index}" in arrays:
         corners = np.ascontiguousarray(arrays[f"uv_{index}"][faces.ravel()])
-        mesh.uv_layers.new(name="uv").uv.foreach_set("vector", corners.ravel())
+        mesh.uv_layers.new(name="uv").data.foreach_set("uv", corners.ravel())
     for name, kind, field in (
         ("base_color", "FLOAT_COLOR", "color"),
         ("roughness", "FLOAT", "value"),
@@ -166,6 +169,8 @@ def add_object(scene: Any, arrays: dict[str, np.ndarray], index: int, material: 
     mesh.update(calc_edges=True)
     mesh.validate()  # drops faces without area or with a corner named twice, which crash Blender
     if is_smooth:
+        if bpy.app.version < (4, 1):  # without it normals of one's own are ignored
+            mesh.use_auto_smooth = True
         mesh.normals_split_custom_set_from_vertices(arrays[f"normals_{index}"])
     mesh.materials.append(material)
     thing = bpy.data.objects.new(mesh.name, mesh)
