@@ -79,7 +79,7 @@ def main() -> None:
     parser.add_argument("--object", type=Path, help="a textured .glb; default a checkered torus")
     parser.add_argument("--metallic", type=float, default=0.0, help="of the checkered torus")
     parser.add_argument("--light", type=Path, help="an environment map; default a made-up studio")
-    parser.add_argument("--blender", default="", help="a blender program or a Python that has bpy; default as installed")
+    parser.add_argument("--blender", default="", help="a blender program or a Python that has bpy")
     options = parser.parse_args()
     generator = np.random.default_rng(0)
     parts = load_object(options.object, generator) if options.object else checkered_torus(options.metallic)

@@ -153,7 +153,7 @@ def _write_material(folder: Path, index: int, material: Material, arrays: dict[s
         return {"kind": "per_vertex"}
     mix = float(material.metallic)
     return {
-        # only an object without any material gets a mix of lobes; what is made by hand is a metal or is not
+        # objects without any material are given a mix of lobes; of others hardly one is half a metal all over
         "kind": "mix" if 0 < mix < 1 else "constant",
         **{name: np.asarray(value, np.float32).tolist() for name, value in values.items()},
     }

@@ -30,10 +30,10 @@ from illuminerf.workflow.errors import UserError
 
 _WORKER = Path(__file__).with_name("blender_worker.py")
 _INSTALL = (
-    "pip install 'illuminerf[blender]' under Python 3.13 (each release of bpy fits one version of Python), or name a "
-    "blender program or a Python that has bpy as the executable (docs/renderers.md)"
+    "pip install 'illuminerf[blender]' under Python 3.13 or 3.11 (each release of bpy fits one version of Python), or "
+    "name a blender program or another Python that has bpy as the executable (docs/renderers.md)"
 )
-_SYSTEM_LIBRARIES = "apt install libxxf86vm1 libxfixes3 libxi6 libxkbcommon0 libxrender1 libsm6 libgl1 libegl1"
+_SYSTEM_LIBRARIES = "apt install libxxf86vm1 libxfixes3 libxi6 libxkbcommon0 libxrender1 libsm6 libgl1 libgomp1"
 _LAST_LINES = 8
 
 
@@ -51,7 +51,7 @@ class BlenderItemRenderer:
     Python, else the blender on the PATH."""
     denoises: bool = False
     """Let OpenImageDenoise work on every picture; it harms sharp reflections."""
-    timeout_seconds: float = 3600.0
+    timeout_seconds: float = 7200.0
     """After which an item is given up."""
     bakes_properties: bool = True
     """Read base colour, roughness and metallic from textures moved onto vertices, as Mitsuba's renderings are by
@@ -156,6 +156,8 @@ def run_blender(command: list[str], log_file: Path, timeout_seconds: float) -> N
         fix = ""
         if "No module named 'bpy'" in words:
             fix = _INSTALL
+        elif "No module named 'numpy'" in words:
+            fix = "install numpy for Blender's own Python (Debian, Ubuntu: apt install python3-numpy)"
         elif ".so" in words and ("cannot open shared object" in words or "shared libraries" in words):
             fix = f"install the system libraries that Blender needs (Debian, Ubuntu: {_SYSTEM_LIBRARIES})"
         raise UserError(f"Blender failed with status {status}", got=words, fix=fix)

@@ -183,11 +183,8 @@ def own_material(folder: Path, index: int, material: dict[str, Any]) -> Any:
     """The part's own material."""
     result = bpy.data.materials.new(f"own_{index}")
     tree = cleared(result)
-    if material["kind"] == "mix":
-        surface = mixed_lobes(tree, material)
-    else:
-        surface = principled(tree, folder, index, material)
-    connect_surface(tree, surface)
+    is_mix = material["kind"] == "mix"
+    connect_surface(tree, mixed_lobes(tree, material) if is_mix else principled(tree, folder, index, material))
     return result
 
 

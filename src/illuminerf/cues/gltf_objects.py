@@ -23,8 +23,8 @@ def load_object(path: Path, generator: np.random.Generator) -> Parts:
     """Read a GLB object, z-up, centred and scaled into the unit sphere.
 
     Objects that hold only geometry get a random colour in [0, 1]^3 and a lobe of roughness U[0.02, 0.5] mixed in by
-    U[0, 1] (paper, supplement "Training Data Processing"; the mix of a glossy and a diffuse lobe of one colour is what
-    metallic means).
+    U[0, 1] (paper, supplement "Training Data Processing"). Deviation: the mix is the metallic of a principled material,
+    whose diffuse part has a coat as well; Blender's renderer mixes the paper's two lobes (docs/renderers.md).
 
     Args:
         path: the .glb file.
