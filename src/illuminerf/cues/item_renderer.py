@@ -1,6 +1,7 @@
 """One training item: an object from one camera under several lights, with its radiance cues and its G-buffer.
 
-`ItemRenderer` is what a path tracer has to do for the training data; `MitsubaItemRenderer` is the default one.
+`ItemRenderer` is what a path tracer has to do for the training data; `MitsubaItemRenderer` is the default one,
+`BlenderItemRenderer` (blender_renderer.py) the paper's.
 """
 
 from dataclasses import dataclass, field
@@ -77,14 +78,16 @@ class MitsubaItemRenderer:
             targets.append(image[..., :3].transpose(2, 0, 1))
             cues.append(tracer.render(camera, 0, light, derived_seed(seed, "cues", index))[:12])
             alpha = np.clip(image[..., 3], 0, 1) if index == 0 else alpha
-        surface = scene.properties(camera, 0)
-        coverage = np.maximum(surface["coverage"], 1e-3)
-        return RenderedItem(
-            np.stack(targets),
-            np.stack(cues),
-            alpha,
-            np.clip(surface["base_color"] / coverage[..., None], 0, 1).transpose(2, 0, 1),
-            np.clip(surface["roughness"] / coverage, 0, 1),
-            np.clip(surface["metallic"] / coverage, 0, 1),
-            surface["normal"].transpose(2, 0, 1),
-        )
+        return RenderedItem(np.stack(targets), np.stack(cues), alpha, *surface_of(scene, camera))
+
+
+def surface_of(scene: ShadedScene, camera: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Base colour, roughness, metallic and normal of what the first view sees, as `RenderedItem` holds them."""
+    surface = scene.properties(camera, 0)
+    coverage = np.maximum(surface["coverage"], 1e-3)
+    return (
+        np.clip(surface["base_color"] / coverage[..., None], 0, 1).transpose(2, 0, 1),
+        np.clip(surface["roughness"] / coverage, 0, 1),
+        np.clip(surface["metallic"] / coverage, 0, 1),
+        surface["normal"].transpose(2, 0, 1),
+    )

@@ -12,10 +12,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from illuminerf.cues.blender_renderer import BlenderFailed, BlenderItemRenderer, worker_command
 from illuminerf.cues.broken_object import BrokenObject
 from illuminerf.cues.item_renderer import ItemRenderer, MitsubaItemRenderer
 from illuminerf.cues.light_library import load_light
 from illuminerf.cues.materials import Parts
+from illuminerf.cues.mitsuba_variant import load_mitsuba
 from illuminerf.cues.object_files import ObjectReading, load_object
 from illuminerf.cues.renderer import CueSampling
 from illuminerf.cues.training_cameras import CameraSphere, draw_camera
@@ -58,6 +60,8 @@ class ViewSettings:
     """Move textures onto vertices, which saves compiling kernels; turn off above 128 pixels."""
     renderer: Literal["mitsuba", "blender"] = "mitsuba"
     """Path tracer; blender is an extra (docs/renderers.md)."""
+    blender: str = ""
+    """A `blender` program, or a Python that has bpy; "" looks for bpy here, then for `blender` on the PATH."""
     split: str = "train"
     """Written into each item's metadata."""
     seed: int = 0
@@ -82,8 +86,19 @@ class ViewSettings:
             bakes_textures=False,
         )
 
+    def check_renderer(self) -> None:
+        """Raise a UserError where the path tracer is not installed."""
+        if self.renderer == "blender":
+            worker_command(self.blender, Path())
+        else:
+            load_mitsuba(self.cue_sampling.device)
+
     def item_renderer(self) -> ItemRenderer:
         """The path tracer."""
+        if self.renderer == "blender":
+            return BlenderItemRenderer(
+                self.samples_per_pixel, self.cue_sampling, self.blender, bakes_properties=self.bakes_textures
+            )
         return MitsubaItemRenderer(self.samples_per_pixel, self.cue_sampling, self.bakes_textures)
 
 
@@ -128,8 +143,8 @@ def render_views(
     for view in views:
         try:
             yield view, _rendered(parts, objects, index, lights, settings, view)
-        except (RuntimeError, ValueError, ArithmeticError, MemoryError) as error:
-            # what the renderer says of an odd mesh; errors of disks and settings are UserErrors and go on up
+        except (BlenderFailed, RuntimeError, ValueError, ArithmeticError, MemoryError) as error:
+            # what a renderer says of an odd mesh; errors of disks and settings are other UserErrors and go on up
             yield view, LeftOut("not rendered", f"{type(error).__name__}: {error}".splitlines()[0])
 
 

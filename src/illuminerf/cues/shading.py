@@ -16,7 +16,8 @@ from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.scene.views import Views
 from illuminerf.workflow.device import derived_seed
 
-_PATH_DEPTH = 6
+PATH_DEPTH = 6
+"""Longest path of shaded pictures, in edges."""
 _PROPERTY_SAMPLES = 16
 
 
@@ -42,7 +43,7 @@ class ShadedScene:
         if light is not self._light:
             self._scene.set_light(light)
             self._light = light
-        return self._scene.render(cameras, view, _PATH_DEPTH, samples_per_pixel, seed)
+        return self._scene.render(cameras, view, PATH_DEPTH, samples_per_pixel, seed)
 
     def properties(self, cameras: Cameras, view: int) -> dict[str, np.ndarray]:
         """What the surface is, without light.

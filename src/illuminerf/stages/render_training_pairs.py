@@ -78,6 +78,7 @@ def run(objects: Path, lights: Path, config: Config, out: str | Path, execution:
         UserError: there are no objects or too few lights, `out` was made with other settings, or it cannot be written.
     """
     execution = execution or Execution()
+    config.views.check_renderer()
     storage = Storage(out)
     collection = _objects(objects, config.choice)
     usable, unusable_lights = _usable_lights(lights, config.views)

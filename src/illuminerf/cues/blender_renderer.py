@@ -1,0 +1,179 @@
+"""`ItemRenderer` on Blender's Cycles, the path tracer of the paper, in a process of its own.
+
+Blender is an optional extra: its module `bpy` fits one version of Python per release, so that the program `blender`
+or another Python may do the work instead. docs/renderers.md says how to install it and how far it is from Mitsuba.
+"""
+
+import contextlib
+import importlib.util
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from illuminerf.cues.blender_job import Rendering, read_rendering, write_job
+from illuminerf.cues.item_renderer import RenderedItem, surface_of
+from illuminerf.cues.materials import Parts
+from illuminerf.cues.renderer import CUE_NAMES, CUE_ROUGHNESS, CueSampling
+from illuminerf.cues.shading import PATH_DEPTH, ShadedScene
+from illuminerf.cues.texture_baking import baked
+from illuminerf.scene.cameras import Cameras
+from illuminerf.scene.environment import EnvironmentMap
+from illuminerf.workflow.device import derived_seed
+from illuminerf.workflow.errors import UserError
+
+_WORKER = Path(__file__).with_name("blender_worker.py")
+_INSTALL = (
+    "pip install 'illuminerf[blender]' under Python 3.13 or 3.11 (each release of bpy fits one version of Python), or "
+    "name a blender program or another Python that has bpy as the executable (docs/renderers.md)"
+)
+_SYSTEM_LIBRARIES = "apt install libxxf86vm1 libxfixes3 libxi6 libxkbcommon0 libxrender1 libsm6 libgl1 libgomp1"
+_LAST_LINES = 8
+
+
+class BlenderFailed(UserError):
+    """Blender is there, but gave no picture of this item: a reason to leave the item out, not to stop."""
+
+
+@dataclass(frozen=True)
+class BlenderItemRenderer:
+    """`ItemRenderer` on Blender's Cycles: one process per item renders every target and cue."""
+
+    samples_per_pixel: int = 512
+    """Paths per pixel of the targets; 512 in the paper."""
+    cue_sampling: CueSampling = field(default_factory=CueSampling)
+    """Paths and bounces of the cues, the same choice as Mitsuba's; device cuda renders on a graphics card, all else on
+    the processor."""
+    executable: str = ""
+    """A blender program, or a Python (its name begins with "python") that has the module bpy; empty: bpy of this
+    Python, else the blender on the PATH."""
+    denoises: bool = False
+    """Let OpenImageDenoise work on every picture; it harms sharp reflections."""
+    timeout_seconds: float = 7200.0
+    """After which an item is given up."""
+    bakes_properties: bool = True
+    """Read base colour, roughness and metallic from textures moved onto vertices, as Mitsuba's renderings are by
+    default; the pictures themselves keep their textures."""
+
+    def __post_init__(self) -> None:
+        if self.samples_per_pixel < 1:
+            raise UserError("samples_per_pixel is too small", got=str(self.samples_per_pixel), wanted="1 or more")
+        if not self.timeout_seconds > 0:
+            raise UserError("timeout_seconds is too small", got=str(self.timeout_seconds), wanted="more than 0")
+
+    def render(self, parts: Parts, camera: Cameras, lights: list[EnvironmentMap], seed: int) -> RenderedItem:
+        """Render what the first view of `camera` sees of `parts`, once per light.
+
+        Raises:
+            UserError: there is no Blender, or it failed or ran out of time; the message has its last lines.
+        """
+        renderings = self._renderings(len(lights), seed)
+        device = self.cue_sampling.device
+        with tempfile.TemporaryDirectory(prefix="illuminerf-blender-") as name:
+            folder = Path(name)
+            write_job(folder, parts, camera, lights, renderings, self.denoises, device)
+            run_blender(worker_command(self.executable, folder), folder / "log.txt", self.timeout_seconds)
+            images = {r.name: _picture(folder, r.name, camera) for r in renderings}
+        planes = {key: image.transpose(2, 0, 1) for key, image in images.items()}
+        targets = [planes[f"target_{i}"][:3] for i in range(len(lights))]
+        cues = [np.concatenate([planes[f"{cue}_{i}"][:3] for cue in CUE_NAMES]) for i in range(len(lights))]
+        scene = ShadedScene(baked(parts) if self.bakes_properties else parts, lights[0], device)
+        alpha = np.clip(images["target_0"][..., 3], 0, 1)
+        return RenderedItem(np.stack(targets), np.stack(cues), alpha, *surface_of(scene, camera))
+
+    def _renderings(self, num_lights: int, seed: int) -> list[Rendering]:
+        cues, result = self.cue_sampling, []
+        for light in range(num_lights):
+            own = derived_seed(seed, "target", light)
+            result.append(Rendering(f"target_{light}", "own", light, self.samples_per_pixel, PATH_DEPTH, own))
+            stream = derived_seed(seed, "cues", light)
+            diffuse = derived_seed(stream, "diffuse")
+            result.append(
+                Rendering(
+                    f"{CUE_NAMES[0]}_{light}", "diffuse", light, cues.samples_per_pixel, cues.diffuse_depth, diffuse
+                )
+            )
+            for name, roughness in zip(CUE_NAMES[1:], CUE_ROUGHNESS, strict=True):
+                lobe = derived_seed(stream, "specular", roughness)
+                depth = cues.specular_depth
+                result.append(
+                    Rendering(f"{name}_{light}", "glossy", light, cues.samples_per_pixel, depth, lobe, roughness)
+                )
+        return result
+
+
+def worker_command(executable: str, folder: Path) -> list[str]:
+    """What renders a job folder: see `BlenderItemRenderer.executable`.
+
+    Raises:
+        UserError: there is nothing that could.
+    """
+    program = executable
+    if not program:
+        program = sys.executable if importlib.util.find_spec("bpy") else shutil.which("blender") or ""
+        if not program:
+            raise UserError("Blender is not installed: no module bpy and no program blender", fix=_INSTALL)
+    found = shutil.which(program)
+    if found is None:
+        raise UserError("the Blender executable does not exist or is no program", got=program, fix=_INSTALL)
+    if Path(found).name.lower().startswith("python"):
+        # -P: the modules beside the worker must not stand in for Blender's own of the same names
+        return [found, "-P", str(_WORKER), str(folder)]
+    options = ["--background", "--factory-startup", "--python-exit-code", "1", "--python", str(_WORKER)]
+    return [found, *options, "--", str(folder)]
+
+
+def run_blender(command: list[str], log_file: Path, timeout_seconds: float) -> None:
+    """Run a command to its end, what it says in a file: the blender program complains on stdout, bpy on stderr.
+
+    Raises:
+        UserError: it does not start, fails or runs out of time.
+    """
+    try:
+        with log_file.open("wb") as log:
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+            )
+    except OSError as error:
+        raise UserError("Blender does not start", got=str(error), fix=_INSTALL) from error
+    try:
+        status = process.wait(timeout_seconds)
+    except subprocess.TimeoutExpired as error:
+        raise BlenderFailed(
+            f"Blender did not finish one item in {timeout_seconds:g} s",
+            got=_last_lines(log_file),
+            fix="use fewer samples or pixels, or a longer timeout_seconds",
+        ) from error
+    finally:
+        if process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # whatever it started goes with it
+            process.wait()
+    if status != 0:
+        words = _last_lines(log_file)
+        fix = ""
+        if "No module named 'bpy'" in words:
+            fix = _INSTALL
+        elif "No module named 'numpy'" in words:
+            fix = "install numpy for Blender's own Python (Debian, Ubuntu: apt install python3-numpy)"
+        elif ".so" in words and ("cannot open shared object" in words or "shared libraries" in words):
+            fix = f"install the system libraries that Blender needs (Debian, Ubuntu: {_SYSTEM_LIBRARIES})"
+        kind = UserError if fix else BlenderFailed
+        raise kind(f"Blender failed with status {status}", got=words, fix=fix)
+
+
+def _picture(folder: Path, name: str, camera: Cameras) -> np.ndarray:
+    if not (folder / f"{name}.exr").is_file():  # Blender may leave with status 0 all the same
+        raise BlenderFailed(f"Blender ended without the picture {name}", got=_last_lines(folder / "log.txt"))
+    return read_rendering(folder, name, camera)
+
+
+def _last_lines(path: Path) -> str:
+    lines = [line.strip() for line in path.read_text(errors="replace").splitlines() if line.strip()]
+    return " | ".join(lines[-_LAST_LINES:]) or "not a word"
