@@ -88,6 +88,18 @@ def test_normals_stay_on_the_outer_side() -> None:
     assert mesh.vertex_normals[:, 0].min() > 0.04 > grazing[2]
 
 
+@pytest.mark.parametrize("is_baked", [True, False], ids=["baked", "unbaked"])
+def test_normals_over_the_horizon_are_laid_onto_it(is_baked: bool) -> None:
+    """Seen from above, a normal that is bent far down faces away; turned round it would point into the plate."""
+    bent = np.radians(80)
+    parts = plate(np.array([0, -np.sin(bent), np.cos(bent)]), np.array([1.0, 0, 0]))
+    camera = turntable_cameras(1, 4.0, 0.4, 8, 8, elevation_radians=np.radians(60))
+    normal = ShadedScene(baked(parts) if is_baked else parts, light_from("z")).properties(camera, 0)["normal"][4, 4]
+    direction = camera.image_rays(0)[1].numpy()[4, 4]
+    assert abs(normal @ direction) < 0.01 and normal[0] > 0.5
+    assert np.array([np.cos(bent), 0, -np.sin(bent)]) @ direction > 0.1
+
+
 def test_degenerate_coordinates_leave_the_normal() -> None:
     (mesh, material), _ = plate(np.array([0, np.sin(TILT), np.cos(TILT)]), np.array([1.0, 0, 0]))
     collapsed = Material(material.base_color, 1.0, 0.0, np.zeros((4, 2), np.float32), normal_map=material.normal_map)

@@ -47,6 +47,25 @@ def brightest(image: np.ndarray) -> tuple[float, float]:
     return float((weights * columns).sum() / weights.sum()), float((weights * rows).sum() / weights.sum())
 
 
+def test_rows_of_the_light_lie_where_the_conventions_say() -> None:
+    """A plate that faces up under a bright cap of 45 degrees: the irradiance over pi is sin^2 45 = 1 / 2."""
+    plate = TriangleMesh(
+        np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32),
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        np.tile(np.array([[0, 0, 1]], np.float32), (4, 1)),
+    )
+    above = camera((0.01, 0, 3), focal=2.0)
+
+    def brightness(lit_rows: float) -> float:
+        rows = np.zeros((32, 64, 3), np.float32)
+        rows[:8] = 1
+        rows[8] = lit_rows
+        return float(cues(plate, above, EnvironmentMap(rows), spp=256)[0].mean())
+
+    assert brightness(0.0) == pytest.approx(0.5, rel=0.01)
+    assert brightness(0.5) > 0.5 * 1.02  # half a row more is seen
+
+
 def test_white_furnace(sphere: TriangleMesh) -> None:
     image = cues(sphere, camera((3, 0, 0)), constant_light(0.7), spp=64)
     inside = image[12] == 1

@@ -43,7 +43,7 @@ class MitsubaScene:
                 "type": "scene",
                 "light": {
                     "type": "envmap",
-                    "bitmap": mi.Bitmap(np.ascontiguousarray(light.linear_rgb, np.float32)),
+                    "bitmap": mi.Bitmap(_rows_from_pole_to_pole(light.linear_rgb)),
                     "to_world": mi.ScalarTransform4f(_WORLD_FROM_ENVMAP),
                 },
                 **shapes,
@@ -64,7 +64,8 @@ class MitsubaScene:
                 fix="resize the lights",
             )
         # Mitsuba pads the map by one wrapped column at either side
-        padded = np.concatenate([light.linear_rgb[:, -1:], light.linear_rgb, light.linear_rgb[:, :1]], 1)
+        rows = _rows_from_pole_to_pole(light.linear_rgb)
+        padded = np.concatenate([rows[:, -1:], rows, rows[:, :1]], 1)
         self.parameters["light.data"] = self.mitsuba.TensorXf(np.ascontiguousarray(padded, np.float32))
         self.parameters.update()
 
@@ -133,6 +134,16 @@ class MitsubaScene:
             total, counted = (spp * values if index == 0 else total + spp * values), counted + spp
         image = total / np.float32(counted)
         return image if square.height == cameras.height else _rows_resampled(image, cameras, view)
+
+
+def _rows_from_pole_to_pole(linear_rgb: np.ndarray) -> np.ndarray:
+    """Our maps have their samples in the middle of each row; Mitsuba's first and last row lie on the poles."""
+    height = len(linear_rgb)
+    at = np.clip(np.arange(height) * (height / max(height - 1, 1)) - 0.5, 0, height - 1)
+    above = np.minimum(at.astype(int), max(height - 2, 0))
+    share = (at - above).astype(np.float32)[:, None, None]
+    below = np.minimum(above + 1, height - 1)
+    return np.ascontiguousarray((1 - share) * linear_rgb[above] + share * linear_rgb[below], np.float32)
 
 
 def _with_square_pixels(cameras: Cameras, view: int) -> Cameras:

@@ -127,6 +127,8 @@ def _read(path: Path, limits: ReadingLimits) -> list[RawPart]:
         # what no check foresaw in a stranger's file still must not stop a run over many
         got = f"{type(error).__name__}: {error}"
         raise BrokenObject("unreadable", f"{path.name} is unreadable", got=got) from error
+    except MemoryError as error:
+        raise BrokenObject("too large", f"{path.name} is too large", got="more than fits into memory") from error
     raise BrokenObject("unreadable", f"{path.name} is of no known format", wanted=", ".join(OBJECT_SUFFIXES))
 
 

@@ -59,7 +59,11 @@ class ShadedScene:
         }
         scene = MitsubaScene(shapes, EnvironmentMap(np.ones((2, 4, 3), np.float32)), self._device)
         first = scene.render_aovs(
-            "color:albedo,normal:sh_normal,depth:depth,tangent:dp_du", cameras, view, _PROPERTY_SAMPLES, 0
+            "color:albedo,normal:sh_normal,depth:depth,tangent:dp_du,flat:geo_normal",
+            cameras,
+            view,
+            _PROPERTY_SAMPLES,
+            0,
         )
         for index, (mesh, material) in enumerate(self._parts):
             _, roughness, metallic = _arrays(mesh, material)
@@ -76,8 +80,7 @@ class ShadedScene:
             third = scene.render_aovs("mapped:albedo", cameras, view, _PROPERTY_SAMPLES, 0)
             found["normal"] = _bent(found["normal"], first[..., 7:10], third[..., :3], found["coverage"])
         _, directions = cameras.image_rays(view)
-        away = (found["normal"] * directions.numpy()).sum(-1, keepdims=True) > 0
-        found["normal"] = np.where(away, -found["normal"], found["normal"]).astype(np.float32)
+        found["normal"] = _toward_camera(found["normal"], first[..., 10:13], directions.numpy())
         return found
 
 
@@ -216,3 +219,12 @@ def _bent(normal: np.ndarray, tangent: np.ndarray, coded: np.ndarray, coverage: 
     tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-12)
     bent = tangent * mapped[..., :1] + np.cross(normal, tangent) * mapped[..., 1:2] + normal * mapped[..., 2:]
     return np.where(coverage[..., None] > 0, bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-6), 0)
+
+
+def _toward_camera(normal: np.ndarray, flat: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Unit normals [h, w, 3] on the side of the face that is seen; where a smooth or mapped one leans over the horizon
+    all the same, it is laid onto it, for turning it round would point it into the surface."""
+    flat = np.where((flat * directions).sum(-1, keepdims=True) > 0, -flat, flat)
+    normal = np.where((normal * flat).sum(-1, keepdims=True) < 0, -normal, normal)
+    normal = normal - directions * np.maximum((normal * directions).sum(-1, keepdims=True), 0)
+    return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)).astype(np.float32)
