@@ -64,8 +64,8 @@ PAPER_EMBEDDING = PyramidConfig(widths=(16, 32, 96, 256), out_channels=320)
 class ConditioningConfig:
     """The three condition networks; the defaults are the paper's two tables and DiLightNet's ConvNet 2."""
 
-    tokens: PyramidConfig = field(default=PAPER_TOKENS)
-    """ConvNet 1 (first table); 64 tokens of 1024 at 512x512."""
+    tokens: PyramidConfig | None = field(default=PAPER_TOKENS)
+    """ConvNet 1 (first table); 64 tokens of 1024 at 512x512. None where the control hears the text too (DiLightNet)."""
     texture: TextureConfig = field(default=TextureConfig())
     """ConvNet 2."""
     embedding: PyramidConfig = field(default=PAPER_EMBEDDING)
@@ -209,7 +209,7 @@ class Conditioning(nn.Module):
     def __init__(self, config: ConditioningConfig) -> None:
         super().__init__()
         self.config = config
-        self.tokens = ConvPyramid(NUM_IMAGE_CHANNELS, config.tokens)
+        self.tokens = None if config.tokens is None else ConvPyramid(NUM_IMAGE_CHANNELS, config.tokens)
         self.texture = TextureNetwork(config.texture)
         self.embedding = ConvPyramid(NUM_CUE_CHANNELS, config.embedding)
 
@@ -225,10 +225,22 @@ class Conditioning(nn.Module):
         self,
         masked_image: Float[Tensor, "batch 4 height width"],
         coded_cues: Float[Tensor, "batch 12 height width"],
+        text: Float[Tensor, "text_length width"] | None = None,
     ) -> Condition:
-        """Args: masked_image: sRGB over black in [0, 1], then the mask. coded_cues: as `encode_cues` gives them."""
+        """Run ConvNets 1 to 3.
+
+        Args:
+            masked_image: sRGB over black in [0, 1], then the mask.
+            coded_cues: as the model's cue coding gives them.
+            text: what the control hears where there is no ConvNet 1.
+        """
         products = self.products(masked_image, coded_cues)
-        tokens = padded_tokens(self.tokens(masked_image), self.config.text_length)
+        if self.tokens is not None:
+            tokens = padded_tokens(self.tokens(masked_image), self.config.text_length)
+        elif text is not None:
+            tokens = text.expand(len(masked_image), -1, -1)
+        else:
+            raise ValueError("without ConvNet 1 a text embedding is needed")
         return Condition(tokens, self.embedding(products), products)
 
 

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from illuminerf.diffusion.augmentation import interpolated_specular, plain_example, stack_examples
 from illuminerf.diffusion.cue_coding import decode_cues
-from illuminerf.diffusion.relighting_model import RelightingModel
+from illuminerf.diffusion.relighter import Relighter
 from illuminerf.diffusion.sampling import Sampler, sample_relit
 from illuminerf.diffusion.training_items import TrainingItem
 from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
@@ -80,7 +80,7 @@ def true_composite(item: TrainingItem, linear_cues: Float[Tensor, "12 height wid
 
 @torch.inference_mode()
 def evaluate(
-    model: RelightingModel,
+    model: Relighter,
     items: list[TrainingItem],
     num_pairs: int = 24,
     num_samples: int = 4,
