@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from illuminerf import benchmark, demo, pipeline
+from illuminerf import benchmark, demo, models, pipeline
 from illuminerf.presets import PRESETS, Preset, customised
 from illuminerf.stages import (
     estimate_geometry,
@@ -171,7 +171,14 @@ COMMANDS: dict[str, Callable[..., Any]] = {
         render_demo_capture.run, render_demo_capture.Config, "Render the bundled demo capture from its formulas.", {}
     ),
 }
-GROUPS: dict[str, dict[str, Callable[..., None]]] = {"benchmark": {"tensoir": benchmark.tensoir_command}}
+GROUPS: dict[str, dict[str, Callable[..., None]]] = {
+    "benchmark": {"tensoir": benchmark.tensoir_command},
+    "models": {
+        "list": models.list_command,
+        "info": models.info_command,
+        "download": models.download_command,
+    },
+}
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -186,7 +193,7 @@ def main(arguments: list[str] | None = None) -> None:
             chosen = tyro.extras.subcommand_cli_from_dict(
                 COMMANDS,
                 prog="illuminerf",
-                description="Relight photographed objects. Also: illuminerf benchmark tensoir --help",
+                description="Relight photographed objects. Also: illuminerf benchmark --help, illuminerf models --help",
                 args=arguments,
             )
             if isinstance(chosen, StageCall):

@@ -225,7 +225,7 @@ class Conditioning(nn.Module):
         self,
         masked_image: Float[Tensor, "batch 4 height width"],
         coded_cues: Float[Tensor, "batch 12 height width"],
-        text: Float[Tensor, "text_length width"] | None = None,
+        text: Float[Tensor, "text_length channels"] | None = None,
     ) -> Condition:
         """Run ConvNets 1 to 3.
 

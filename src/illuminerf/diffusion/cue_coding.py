@@ -17,7 +17,9 @@ MAX_RADIANCE = 16.0
 
 
 def code_cues(
-    linear_cues: Float[Tensor, "*batch 12 height width"], alpha: Float[Tensor, "*batch 1 height width"], coding: CueCoding
+    linear_cues: Float[Tensor, "*batch 12 height width"],
+    alpha: Float[Tensor, "*batch 1 height width"],
+    coding: CueCoding,
 ) -> Float[Tensor, "*batch 12 height width"]:
     """Straight linear radiance as a model wants it: by `encode_cues`, or as DiLightNet's hints.
 

@@ -4,7 +4,7 @@ Two kinds: `RelightingModel` (the embedded one, small, base of our own) and `Con
 Stable-Diffusion-class base under a control, 512x512; the published DiLightNet weights are of this kind).
 """
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -22,6 +22,7 @@ class Piece(NamedTuple):
     """Straight linear radiance under the target light."""
 
 
+@runtime_checkable
 class Relighter(Protocol):
     """p(relit image | image, cues) as a denoiser of latents."""
 

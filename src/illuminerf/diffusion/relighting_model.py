@@ -106,6 +106,11 @@ class RelightingModel(nn.Module):
         self.register_buffer("empty_text", empty)
 
     @property
+    def frozen_prefixes(self) -> tuple[str, ...]:
+        """What is not trained, by the beginning of its name in the state dict: nothing."""
+        return ()
+
+    @property
     def image_size(self) -> int:
         """See `Relighter`."""
         return self.config.image_size
