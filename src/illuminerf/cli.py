@@ -57,7 +57,7 @@ def relight_command(
         rotate: Turns the light about the vertical axis, in degrees, counter-clockwise seen from above.
         exposure: Stops by which the light is made brighter.
         background: Plain background to cut away where the photographs have no masks: white or black.
-        model: Folder of another relighting model than the preset's.
+        model: Another relighting model than the preset's: a folder, embedded or dilightnet.
     """
     settings = customised(
         preset, samples=samples, size=size, seed=seed, device=device, rotate_degrees=rotate, exposure_stops=exposure,
@@ -133,7 +133,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "relight-views": _stage(
         relight_views.run,
         relight_views.Config,
-        "Draw relit samples of every photograph; the model is a folder, or the word embedded.",
+        "Draw relit samples of every photograph; the model is a folder, or the word embedded or dilightnet.",
         {"capture": Path, "cues": Path, "model": str},
     ),
     "fit-latent-nerf": _stage(

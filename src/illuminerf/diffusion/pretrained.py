@@ -5,7 +5,13 @@ from pathlib import Path
 
 import torch
 
-from illuminerf.diffusion.controlled_base import ControlledBase, load_controlled, read_config, save_controlled
+from illuminerf.diffusion.controlled_base import (
+    ControlledBase,
+    ControlledBaseConfig,
+    load_controlled,
+    read_config,
+    save_controlled,
+)
 from illuminerf.diffusion.dilightnet import is_published, load_published, published_config
 from illuminerf.diffusion.frozen_base import load_base
 from illuminerf.diffusion.hub import DILIGHTNET_CONTROL, KNOWN, find_base, placement, repository_folder
@@ -42,6 +48,24 @@ def model_folder(model: Path | str) -> Path:
     return folder
 
 
+def check_model(model: Path | str) -> None:
+    """Find what is missing before hours are spent on other stages.
+
+    Raises:
+        UserError: there is no such model, or its base is not on this machine.
+    """
+    config = _controlled_config(model_folder(model))
+    if config is not None:
+        find_base(config.base, config.revision)
+
+
+def _controlled_config(folder: Path) -> ControlledBaseConfig | None:
+    """The configuration of a model that stands on a base; None for the embedded kind."""
+    if is_published(folder):
+        return published_config(folder)
+    return read_config(folder) if "base" in read_json(folder / "relighting_model.json") else None
+
+
 def pretrained_model(model: Path | str, device: torch.device | str = "cpu") -> RelightingModel | ControlledBase:
     """Load `model_folder(model)`, of either kind, ready to sample.
 
@@ -49,14 +73,11 @@ def pretrained_model(model: Path | str, device: torch.device | str = "cpu") -> R
         UserError: a file is missing or corrupt, or the base is not on this machine.
     """
     folder = model_folder(model)
-    if is_published(folder):
-        config = published_config(folder)
-        loaded = load_published(folder, load_base(find_base(config.base, config.revision)))
-    elif "base" in read_json(folder / "relighting_model.json"):
-        config = read_config(folder)
-        loaded = load_controlled(folder, load_base(find_base(config.base, config.revision)))
-    else:
+    config = _controlled_config(folder)
+    if config is None:
         return load_model(folder, device)
+    base = load_base(find_base(config.base, config.revision))
+    loaded = load_published(folder, base) if is_published(folder) else load_controlled(folder, base)
     return loaded.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
