@@ -97,15 +97,22 @@ class StageCall:
         say(f"done: {out}")
 
 
-def _stage(run: Callable[..., Path], config: type, description: str, inputs: dict[str, Any]) -> type[StageCall]:
-    """A subcommand of one stage: its inputs as positional arguments, its config's fields as options, and --out."""
+def _stage(
+    run: Callable[..., Path],
+    config: type,
+    description: str,
+    inputs: dict[str, Any],
+    default: Callable[[], Any] | None = None,
+) -> type[StageCall]:
+    """A subcommand of one stage: its inputs as positional arguments, its config's fields as options (with the values of
+    `default`, else the config's own), and --out."""
     fields: list[tuple[str, Any, Any]] = []
     for name, kind in inputs.items():
         is_optional = kind == Path | None
         argument = kind if is_optional else Annotated[kind, tyro.conf.Positional]
         fields.append((name, argument, field(default=None) if is_optional else field()))
     fields.append(("out", Path, field()))
-    fields.append(("config", Annotated[config, tyro.conf.arg(name="")], field(default_factory=config)))
+    fields.append(("config", Annotated[config, tyro.conf.arg(name="")], field(default_factory=default or config)))
     call = make_dataclass("Stage", fields, bases=(StageCall,), kw_only=True)
     call.run, call.inputs, call.__doc__ = staticmethod(run), tuple(inputs), description  # type: ignore[attr-defined]
     return call
@@ -165,6 +172,13 @@ COMMANDS: dict[str, Callable[..., Any]] = {
         train_relighting_model.Config,
         "Train a relighting diffusion model on rendered pairs.",
         {"pairs": Path, "heldout": Path},
+    ),
+    "train-paper-rdm": _stage(
+        train_relighting_model.run,
+        train_relighting_model.Config,
+        "Train the paper's control on the frozen base --control.base: train-rdm with the paper's settings.",
+        {"pairs": Path, "heldout": Path},
+        train_relighting_model.Config.paper,
     ),
     "evaluate-rdm": benchmark.relighting_model_command,
     "render-demo-capture": _stage(

@@ -85,6 +85,11 @@ class ControlledBase(nn.Module):
         return ("base.",)
 
     @property
+    def device(self) -> torch.device:
+        """See `Relighter`."""
+        return self.control.conv_in.weight.device
+
+    @property
     def image_size(self) -> int:
         """See `Relighter`."""
         return self.config.image_size

@@ -12,6 +12,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from illuminerf.workflow.processes import sum_over_processes
+
 
 @dataclass(frozen=True)
 class PatchLatentConfig:
@@ -59,8 +61,11 @@ class PatchLatents(nn.Module):
 
     @torch.no_grad()
     def measure(self, image: Float[Tensor, "batch 3 height width"], covered: Tensor, momentum: float) -> None:
-        """Move `scale` towards the root mean square of the coefficients over `covered` [batch, 1, rows, columns]."""
-        squares = (self.coefficients(image).square() * covered).sum((0, 2, 3)) / covered.sum().clamp_min(1.0)
+        """Move `scale` towards the root mean square of the coefficients over `covered` [batch, 1, rows, columns], of
+        all processes' images."""
+        sums = (self.coefficients(image).square() * covered).sum((0, 2, 3))
+        sums = sum_over_processes(torch.cat([sums, covered.sum()[None]]))
+        squares = sums[:-1] / sums[-1].clamp_min(1.0)
         self.scale.copy_(((1 - momentum) * self.scale.square() + momentum * squares).clamp_min(1e-6).sqrt())
 
 

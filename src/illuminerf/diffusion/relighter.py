@@ -6,6 +6,7 @@ Stable-Diffusion-class base under a control, 512x512; the published DiLightNet w
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -25,6 +26,10 @@ class Piece(NamedTuple):
 @runtime_checkable
 class Relighter(Protocol):
     """p(relit image | image, cues) as a denoiser of latents."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
 
     @property
     def image_size(self) -> int:

@@ -111,6 +111,11 @@ class RelightingModel(nn.Module):
         return ()
 
     @property
+    def device(self) -> torch.device:
+        """See `Relighter`."""
+        return self.control.conv_in.weight.device
+
+    @property
     def image_size(self) -> int:
         """See `Relighter`."""
         return self.config.image_size

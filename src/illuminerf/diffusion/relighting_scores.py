@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from illuminerf.diffusion.augmentation import interpolated_specular, plain_example, stack_examples
-from illuminerf.diffusion.cue_coding import decode_cues
+from illuminerf.diffusion.cue_coding import decode_cues, encode_cues
 from illuminerf.diffusion.relighter import Relighter
 from illuminerf.diffusion.sampling import Sampler, sample_relit
 from illuminerf.diffusion.training_items import TrainingItem
@@ -91,36 +91,43 @@ def evaluate(
 ) -> tuple[dict[str, dict[str, float]], dict[str, Float[Tensor, "pairs 3 height width"]]]:
     """Scores by estimate ({name: {psnr, ssim}}), and the images, on held-out items.
 
-    Estimates: input (the image itself), mean_albedo (its mean albedo * diffuse cue), anchor (products alone),
-    sample (one sample, averaged), mean (mean of samples), best (best sample), bound (true materials).
+    Estimates: input (the image itself), mean_albedo (its mean albedo * diffuse cue), anchor (products alone, of
+    models that have one), sample (one sample, averaged), mean (mean of samples), best (best sample), bound (true
+    materials).
     `spread` is the samples' standard deviation over covered pixels, in sRGB.
     """
     pairs = held_out_pairs(items, num_pairs)
     examples = [plain_example(*pair) for pair in pairs]
-    batch = stack_examples(examples)
+    batch = stack_examples(examples, model.cue_coding)
+    diffuse_cues = encode_cues(torch.stack([example[1] for example in examples]))[:, :3]
     samples, anchors = [], []
     for start in range(0, len(pairs), batch_size):
-        image, cues = batch.masked_image[start : start + batch_size], batch.coded_cues[start : start + batch_size]
+        rows = slice(start, start + batch_size)
+        image, cues = batch.masked_image[rows].to(model.device), batch.coded_cues[rows].to(model.device)
         seeds = [[1000 * (start + i) + k for k in range(num_samples)] for i in range(len(image))]
-        samples.append(sample_relit(model, image, cues, seeds, num_steps, sampler, temperature))
-        anchors.append(model.anchor(model.condition(image, cues), image[:, 3:]))
+        samples.append(sample_relit(model, image, cues, seeds, num_steps, sampler, temperature).cpu())
+        if model.latent_is_residual:
+            anchors.append(model.anchor(model.condition(image, cues), image[:, 3:]).float().cpu())
     drawn = torch.cat(samples)
     bounds = [true_composite(pair[0], example[1]) for pair, example in zip(pairs, examples, strict=True)]
     images = {
         "input": batch.masked_image[:, :3],
-        "mean_albedo": _mean_albedo_estimate(batch.masked_image, decode_cues(batch.coded_cues[:, :3])),
-        "anchor": torch.cat(anchors),
+        "mean_albedo": _mean_albedo_estimate(batch.masked_image, decode_cues(diffuse_cues)),
         "mean": drawn.mean(1),
         "bound": srgb_from_linear(torch.stack(bounds)).clamp_max(1) * batch.alpha,
     }
+    if anchors:
+        images["anchor"] = torch.cat(anchors)
     truth, alpha = batch.target, batch.alpha
     scores = {name: _scores(image, truth, alpha) for name, image in images.items()}
-    each = torch.stack([masked_psnr(rescaled(drawn[:, k], truth), truth, alpha) for k in range(num_samples)])
-    scores["sample"] = {"psnr": float(each.mean())}
-    scores["best"] = {"psnr": float(each.max(0).values.mean())}
+    ours = [rescaled(drawn[:, k], truth) for k in range(num_samples)]
+    psnr = torch.stack([masked_psnr(one, truth, alpha) for one in ours])
+    ssim = torch.stack([masked_ssim(one, truth, alpha) for one in ours])
+    scores["sample"] = {"psnr": float(psnr.mean()), "ssim": float(ssim.mean())}
+    scores["best"] = {"psnr": float(psnr.max(0).values.mean()), "ssim": float(ssim.max(0).values.mean())}
     deviation = drawn.std(1) if num_samples > 1 else torch.zeros_like(truth)
     scores["spread"] = {"srgb": float((deviation * alpha).sum() / (3 * alpha.sum()))}
-    return scores, images | {"truth": truth, "sample": drawn[:, 0], "diffuse_cue": batch.coded_cues[:, :3]}
+    return scores, images | {"truth": truth, "sample": drawn[:, 0], "diffuse_cue": diffuse_cues}
 
 
 def _scores(estimate: Tensor, truth: Tensor, alpha: Tensor) -> dict[str, float]:
