@@ -124,7 +124,8 @@ def anchor_loss(
 ) -> Float[Tensor, ""]:
     """Squared sRGB error of the composited products over covered pixels, divided by their number.
 
-    `covered` is that number in the whole step, where `batch` is a part of it. Only where the target is saturated may the products be brighter than 1 for free.
+    `covered` is that number in the whole step, where `batch` is a part of it. Only where the target is saturated may
+    the products be brighter than 1 for free.
     """
     estimate = composited_srgb(products).clamp_max(2.0) * batch.alpha
     saturated = (batch.target >= batch.alpha) & (estimate > batch.target)

@@ -3,6 +3,8 @@
 The scale (least squares in linear light) takes out what a single image cannot tell: albedo against exposure.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -60,13 +62,24 @@ def masked_ssim(
 
 
 def held_out_pairs(items: list[TrainingItem], num_pairs: int) -> list[tuple[TrainingItem, int, int]]:
-    """Deterministic (item, input light, target light), spread over items and lights."""
-    pairs = []
-    for index in range(num_pairs):
-        item = items[(index * max(1, len(items) // num_pairs)) % len(items)]
-        lights = len(item.targets)
-        first = index % lights
-        pairs.append((item, first, (first + 1 + (index // lights) % (lights - 1)) % lights))
+    """Deterministic (item, input light, target light), all different, spread over items and lights.
+
+    There are fewer than `num_pairs` where the items' lights allow no more.
+    """
+    pairs: list[tuple[TrainingItem, int, int]] = []
+    stride = max(1, len(items) // num_pairs)
+    chosen = list(enumerate(items))[::stride][:num_pairs]
+    rounds = max(len(item.targets) * (len(item.targets) - 1) for item in items)
+    for index in range(len(chosen) * rounds):
+        number, item = chosen[index % len(chosen)]
+        lights, turn = len(item.targets), index // len(chosen)
+        orders = lights * (lights - 1)
+        if turn < orders and len(pairs) < num_pairs:
+            # Each turn takes another of the item's ordered pairs of lights: steps of a number prime to their count.
+            start = (number % lights) * (lights - 1) + (number // lights) % (lights - 1)
+            step = next(k for k in range(orders // 2 + 1, 2 * orders + 2) if math.gcd(k, orders) == 1)
+            first, offset = divmod((start + turn * step) % orders, lights - 1)
+            pairs.append((item, first, (first + 1 + offset) % lights))
     return pairs
 
 
