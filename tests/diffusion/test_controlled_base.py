@@ -12,7 +12,7 @@ from illuminerf.diffusion.empty_text import load_empty_text, save_empty_text
 from illuminerf.diffusion.frozen_base import load_base
 from illuminerf.diffusion.full_size import Photograph, relight_photographs
 from illuminerf.diffusion.pretrained import pretrained_model
-from illuminerf.diffusion.sampling import sample_relit
+from illuminerf.diffusion.sampling import Sampler, sample_relit, sampling_schedule
 from illuminerf.workflow.atomic import read_json, write_json
 from illuminerf.workflow.checkpoint import load_checkpoint, save_checkpoint
 from illuminerf.workflow.errors import UserError
@@ -162,6 +162,31 @@ def test_what_does_not_fit_is_a_user_error(base: Path, tmp_path: Path) -> None:
     save_checkpoint(broken / "unet" / WEIGHTS, load_checkpoint(base / "unet" / WEIGHTS)[0], {})
     with pytest.raises(UserError, match="do not fit"):
         load_base(broken)
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm_solver"])
+def test_a_seed_decides_a_sample_whatever_the_batch(base: Path, sampler: Sampler) -> None:
+    model = with_noise_in_every_weight(tiny_controlled(base))  # type: ignore[arg-type]
+    image, cues = random_condition_inputs(2, 32)
+    together = sample_relit(model, image, cues, [[1, 2], [3, 4]], 3, sampler)
+    alone = sample_relit(model, image[1:], cues[1:], [[4]], 3, sampler)
+    torch.testing.assert_close(together[1, 1], alone[0, 0], atol=1e-4, rtol=0)
+    assert (together[1, 0] - together[1, 1]).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm_solver"])
+def test_samplers_find_a_known_point_from_its_noise(base: Path, sampler: Sampler) -> None:
+    """With the exact noise of a point distribution, under the base's schedule, every sampler must end on the point."""
+    trained = load_base(base).noise_schedule()
+    scheduler = sampling_schedule(sampler, 20, trained)
+    assert scheduler.config.prediction_type == "epsilon"
+    point, latent = torch.tensor([0.7, -1.1]).reshape(1, 2, 1, 1), torch.randn(1, 2, 1, 1)
+    extra = {"generator": torch.Generator().manual_seed(0)} if sampler == "ddpm" else {}
+    for timestep in scheduler.timesteps:
+        cumulative = trained.alphas_cumprod[timestep]
+        noise = (latent - cumulative.sqrt() * point) / (1 - cumulative).sqrt()
+        latent = scheduler.step(noise, timestep, latent, return_dict=False, **extra)[0]
+    torch.testing.assert_close(latent, point, atol=0.01, rtol=0)
 
 
 def test_both_kinds_relight_photographs(base: Path) -> None:

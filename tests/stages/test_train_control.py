@@ -141,9 +141,11 @@ import sys
 from pathlib import Path
 import torch
 from illuminerf.stages import train_relighting_model
+from illuminerf.stages.train_relighting_model import ExecutionConfig
 from tests.stages.test_train_control import control_config, embedded_config
 pairs, base, out = map(Path, sys.argv[1:])
-train_relighting_model.run(pairs, pairs, control_config(base), out / "control")
+spread = control_config(base, accumulation=2, execution=ExecutionConfig(checkpoints_gradients=True))
+train_relighting_model.run(pairs, pairs, spread, out / "control")
 train_relighting_model.run(pairs, pairs, embedded_config(), out / "embedded")
 assert torch.distributed.get_world_size() == 2
 """

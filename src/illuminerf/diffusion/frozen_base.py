@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from illuminerf.diffusion.empty_text import load_empty_text
 from illuminerf.workflow.atomic import read_json
 from illuminerf.workflow.checkpoint import load_checkpoint
+from illuminerf.workflow.device import full_precision
 from illuminerf.workflow.errors import UserError
 
 WEIGHTS = "diffusion_pytorch_model.safetensors"
@@ -75,7 +76,8 @@ class FrozenBase(nn.Module):
     @torch.no_grad()
     def decode(self, latent: Float[Tensor, "batch channels rows columns"]) -> Float[Tensor, "batch 3 height width"]:
         """Scaled latents to images in [-1, 1], unclipped."""
-        return self.vae.decode(latent / self.vae.config.scaling_factor + self._shift, return_dict=False)[0]
+        with full_precision(latent.device):  # eight bits of mantissa would show in smooth shading
+            return self.vae.decode(latent / self.vae.config.scaling_factor + self._shift, return_dict=False)[0]
 
     @property
     def _shift(self) -> float:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from illuminerf.workflow.device import full_precision
 from illuminerf.workflow.processes import sum_over_processes
 
 
@@ -52,12 +53,14 @@ class PatchLatents(nn.Module):
 
     def coefficients(self, image: Float[Tensor, "batch 3 height width"]) -> Tensor:
         """The transform alone."""
-        return functional.conv2d(image, self.basis, stride=self.config.block)
+        with full_precision(image.device):
+            return functional.conv2d(image.float(), self.basis, stride=self.config.block)
 
     def decode(self, latent: Float[Tensor, "batch channels rows columns"]) -> Float[Tensor, "batch 3 height width"]:
         """Undo `encode`; frequencies that were not kept are zero."""
         coefficients = latent * self.scale[:, None, None]
-        return functional.conv_transpose2d(coefficients, self.basis, stride=self.config.block)
+        with full_precision(latent.device):
+            return functional.conv_transpose2d(coefficients.float(), self.basis, stride=self.config.block)
 
     @torch.no_grad()
     def measure(self, image: Float[Tensor, "batch 3 height width"], covered: Tensor, momentum: float) -> None:

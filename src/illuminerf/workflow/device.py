@@ -41,6 +41,11 @@ def autocast(device: torch.device, precision: Precision) -> AbstractContextManag
     return torch.autocast(device.type, torch.bfloat16)
 
 
+def full_precision(device: torch.device) -> AbstractContextManager[object]:
+    """No autocast inside, for the few operations whose results are targets or images."""
+    return nullcontext() if device.type == "meta" else torch.autocast(device.type, enabled=False)
+
+
 def derived_seed(seed: int, *names: object) -> int:
     """A 63-bit seed for one named random stream, e.g. (7, "relight", view, sample): streams never collide."""
     text = "\0".join([str(seed), *map(str, names)])
