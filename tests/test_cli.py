@@ -1,5 +1,6 @@
 """What a person sees who gets something wrong: one clear line, exit status 2, nothing half-written."""
 
+import runpy
 import shutil
 from pathlib import Path
 
@@ -135,3 +136,9 @@ def test_missing_weights_are_found_before_the_geometry_is_fitted(
     monkeypatch.setenv("ILLUMINERF_MODELS", str(tmp_path / "models"))
     assert "models download dilightnet" in refused(relight(capture, tmp_path, "--preset", "dilightnet"), capsys)
     assert not (tmp_path / "run").exists()
+
+
+def test_the_package_runs_as_a_module(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["illuminerf", "presets"])
+    runpy.run_module("illuminerf", run_name="__main__")
+    assert "dilightnet" in capsys.readouterr().err

@@ -133,7 +133,7 @@ def test_paper_settings() -> None:
         1000,
     )
     assert paper.phase_at(149_999).size == 512 and paper.final_share == 0
-    assert paper.control.conditioning.tokens is not None and paper.control.conditioning.tokens.out_channels == 1024
+    assert not paper.control.conditioning.hears_text and paper.control.conditioning.tokens.out_channels == 1024
 
 
 SCRIPT = """

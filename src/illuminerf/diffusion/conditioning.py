@@ -64,14 +64,16 @@ PAPER_EMBEDDING = PyramidConfig(widths=(16, 32, 96, 256), out_channels=320)
 class ConditioningConfig:
     """The three condition networks; the defaults are the paper's two tables and DiLightNet's ConvNet 2."""
 
-    tokens: PyramidConfig | None = field(default=PAPER_TOKENS)
-    """ConvNet 1 (first table); 64 tokens of 1024 at 512x512. None where the control hears the text too (DiLightNet)."""
+    tokens: PyramidConfig = field(default=PAPER_TOKENS)
+    """ConvNet 1 (first table); 64 tokens of 1024 at 512x512."""
     texture: TextureConfig = field(default=TextureConfig())
     """ConvNet 2."""
     embedding: PyramidConfig = field(default=PAPER_EMBEDDING)
     """ConvNet 3 (second table)."""
     text_length: int = 77
     """Tokens of the text encoder, to which ConvNet 1's are zero-padded."""
+    hears_text: bool = False
+    """The control attends to the text in place of ConvNet 1's tokens (DiLightNet; not in the paper)."""
 
 
 class Condition(NamedTuple):
@@ -209,7 +211,7 @@ class Conditioning(nn.Module):
     def __init__(self, config: ConditioningConfig) -> None:
         super().__init__()
         self.config = config
-        self.tokens = None if config.tokens is None else ConvPyramid(NUM_IMAGE_CHANNELS, config.tokens)
+        self.tokens = None if config.hears_text else ConvPyramid(NUM_IMAGE_CHANNELS, config.tokens)
         self.texture = TextureNetwork(config.texture)
         self.embedding = ConvPyramid(NUM_CUE_CHANNELS, config.embedding)
 

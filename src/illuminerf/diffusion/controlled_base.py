@@ -69,7 +69,7 @@ class ControlledBase(nn.Module):
     def _check(self) -> None:
         unet, conditioning = self.base.unet.config, self.config.conditioning
         wanted = (conditioning.text_length, unet.cross_attention_dim, unet.block_out_channels[0])
-        tokens = conditioning.tokens.out_channels if conditioning.tokens else unet.cross_attention_dim
+        tokens = unet.cross_attention_dim if conditioning.hears_text else conditioning.tokens.out_channels
         got = (len(self.base.empty_text), tokens, conditioning.embedding.out_channels)
         if got != wanted:
             raise UserError(

