@@ -1,5 +1,6 @@
 """What a person sees who gets something wrong: one clear line, exit status 2, nothing half-written."""
 
+import runpy
 import shutil
 from pathlib import Path
 
@@ -103,7 +104,12 @@ def test_benchmark_asks_for_what_it_needs(tmp_path: Path, capsys: pytest.Capture
 
 @pytest.mark.parametrize(
     "arguments",
-    [["--help"], ["benchmark", "tensoir", "--help"], *([command, "--help"] for command in COMMANDS)],
+    [
+        ["--help"],
+        ["benchmark", "tensoir", "--help"],
+        ["models", "download", "--help"],
+        *([command, "--help"] for command in COMMANDS),
+    ],
     ids=" ".join,
 )
 def test_help(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -122,3 +128,17 @@ def test_a_relighting_model_is_scored_on_rendered_pairs_only(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert "no training items" in refused(["evaluate-rdm", "embedded", str(tmp_path)], capsys)
+
+
+def test_missing_weights_are_found_before_the_geometry_is_fitted(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ILLUMINERF_MODELS", str(tmp_path / "models"))
+    assert "models download dilightnet" in refused(relight(capture, tmp_path, "--preset", "dilightnet"), capsys)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_package_runs_as_a_module(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["illuminerf", "presets"])
+    runpy.run_module("illuminerf", run_name="__main__")
+    assert "dilightnet" in capsys.readouterr().err

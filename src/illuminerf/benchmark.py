@@ -10,11 +10,12 @@ from rich.table import Table
 from illuminerf import pipeline
 from illuminerf.data.tensoir import load_test_cameras
 from illuminerf.diffusion.pretrained import pretrained_model
-from illuminerf.diffusion.relighting_scores import evaluate
+from illuminerf.diffusion.relighting_scores import evaluate, held_out_pairs
+from illuminerf.diffusion.sampling import Sampler
 from illuminerf.diffusion.training_items import load_items
 from illuminerf.evaluation.benchmark_rule import on_white
 from illuminerf.evaluation.tables import cell_table, published_table
-from illuminerf.presets import Preset, customised
+from illuminerf.presets import DILIGHTNET, EMBEDDED, Preset, customised
 from illuminerf.scene.images import read_png, write_png
 from illuminerf.stages.score_predictions import score_input_light, score_predictions
 from illuminerf.workflow.atomic import write_json
@@ -22,6 +23,15 @@ from illuminerf.workflow.device import resolve_device
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import console
 
+_ESTIMATES = {
+    "": "sample",
+    "_mean_of_samples": "mean",
+    "_best_of_samples": "best",
+    "_input": "input",
+    "_albedo_cue": "mean_albedo",
+    "_products": "anchor",
+    "_upper_bound": "bound",
+}
 TENSOIR_LIGHTS = ("bridge", "city", "fireplace", "forest", "night")
 
 
@@ -81,46 +91,55 @@ def relighting_model_command(
     model: tyro.conf.Positional[str],
     data: tyro.conf.Positional[Path],
     json: Path | None = None,
-    pairs: int = 48,
+    pairs: int = 200,
     samples: int = 4,
-    steps: int = 4,
-    temperature: float = 0.6,
+    steps: int | None = None,
+    sampler: Sampler | None = None,
+    temperature: float | None = None,
     device: str = "auto",
 ) -> None:
     """Score a relighting model on rendered pairs of held-out objects and lights (see docs/model_card.md).
 
+    Over the object's pixels, after the least-squares scale per image and channel in linear light.
+
     Args:
-        model: A model folder, or the word embedded.
+        model: A model folder, or the word embedded or dilightnet.
         data: What render-training-pairs made of held-out objects and lights.
         json: Write the scores here.
-        pairs: How many (input light, target light) pairs, spread over the renders.
+        pairs: How many different (input light, target light) pairs at most, spread over the renders.
         samples: Samples per pair.
-        steps: Denoising steps.
-        temperature: Factor on the initial noise.
+        steps: Denoising steps; the model's usual number where it is left out.
+        sampler: ddpm, ddim or dpm_solver; the model's usual one where it is left out.
+        temperature: Factor on the initial noise; the model's usual one where it is left out.
         device: auto, cpu or cuda.
     """
     network = pretrained_model(model, resolve_device(device))
-    items = load_items(data, network.config.image_size)
-    scores, _ = evaluate(network, items, pairs, samples, steps, temperature=temperature)
+    items = load_items(data, network.image_size)
+    usual = (EMBEDDED if network.latent_is_residual else DILIGHTNET).relighting
+    num_steps = usual.num_steps if steps is None else steps
+    chosen_sampler = usual.sampler if sampler is None else sampler
+    factor = usual.temperature if temperature is None else temperature
+    num_pairs = len(held_out_pairs(items, pairs))
+    scores, _ = evaluate(network, items, num_pairs, samples, num_steps, chosen_sampler, temperature=factor)
     named = {
-        "psnr": scores["sample"]["psnr"],
-        "psnr_mean_of_samples": scores["mean"]["psnr"],
-        "psnr_input": scores["input"]["psnr"],
-        "psnr_albedo_cue": scores["mean_albedo"]["psnr"],
-        "psnr_products": scores["anchor"]["psnr"],
-        "psnr_upper_bound": scores["bound"]["psnr"],
-        "ssim_mean_of_samples": scores["mean"]["ssim"],
-        "ssim_input": scores["input"]["ssim"],
-        "spread": scores["spread"]["srgb"],
+        f"{metric}{suffix}": scores[estimate][metric]
+        for metric in ("psnr", "ssim")
+        for suffix, estimate in _ESTIMATES.items()
+        if estimate in scores
     }
+    named["spread"] = scores["spread"]["srgb"]
     if json is not None:
-        write_json(json, named | {"renders": len(items), "pairs": pairs, "samples": samples, "steps": steps})
-    table = Table(title=f"Relighting model on {len(items)} renders, {pairs} pairs: PSNR over the object, rescaled")
+        how = {"samples": samples, "steps": num_steps, "sampler": chosen_sampler, "temperature": factor}
+        write_json(json, named | {"renders": len(items), "pairs": num_pairs, **how})
+    drawn = f"{len(items)} renders, {num_pairs} pairs, {samples} samples"
+    table = Table(title=f"Relighting model on {drawn}: over the object, rescaled")
     table.add_column("estimate")
     table.add_column("PSNR", justify="right")
-    for name, value in named.items():
-        if name.startswith("psnr"):
-            table.add_row(name.removeprefix("psnr_").replace("psnr", "one sample").replace("_", " "), f"{value:.2f}")
+    table.add_column("SSIM", justify="right")
+    for suffix, estimate in _ESTIMATES.items():
+        if estimate in scores:
+            label = suffix.removeprefix("_").replace("_", " ") or "one sample"
+            table.add_row(label, f"{named[f'psnr{suffix}']:.2f}", f"{named[f'ssim{suffix}']:.3f}")
     console.print(table)
 
 

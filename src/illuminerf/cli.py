@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar
 
 import tyro
 
-from illuminerf import benchmark, demo, pipeline
+from illuminerf import benchmark, demo, models, pipeline
 from illuminerf.data.objaverse_download import download_objaverse
 from illuminerf.data.object_collection import read_ids
 from illuminerf.presets import PRESETS, Preset, customised
@@ -66,7 +66,7 @@ def relight_command(
         rotate: Turns the light about the vertical axis, in degrees, counter-clockwise seen from above.
         exposure: Stops by which the light is made brighter.
         background: Plain background to cut away where the photographs have no masks: white or black.
-        model: Folder of another relighting model than the preset's.
+        model: Another relighting model than the preset's: a folder, embedded or dilightnet.
     """
     settings = customised(
         preset, samples=samples, size=size, seed=seed, device=device, rotate_degrees=rotate, exposure_stops=exposure,
@@ -176,15 +176,22 @@ class StageCall:
         say(f"done: {out}")
 
 
-def _stage(run: Callable[..., Path], config: type, description: str, inputs: dict[str, Any]) -> type[StageCall]:
-    """A subcommand of one stage: its inputs as positional arguments, its config's fields as options, and --out."""
+def _stage(
+    run: Callable[..., Path],
+    config: type,
+    description: str,
+    inputs: dict[str, Any],
+    default: Callable[[], Any] | None = None,
+) -> type[StageCall]:
+    """A subcommand of one stage: its inputs as positional arguments, its config's fields as options (with the values of
+    `default`, else the config's own), and --out."""
     fields: list[tuple[str, Any, Any]] = []
     for name, kind in inputs.items():
         is_optional = kind == Path | None
         argument = kind if is_optional else Annotated[kind, tyro.conf.Positional]
         fields.append((name, argument, field(default=None) if is_optional else field()))
     fields.append(("out", Path, field()))
-    fields.append(("config", Annotated[config, tyro.conf.arg(name="")], field(default_factory=config)))
+    fields.append(("config", Annotated[config, tyro.conf.arg(name="")], field(default_factory=default or config)))
     call = make_dataclass("Stage", fields, bases=(StageCall,), kw_only=True)
     call.run, call.inputs, call.__doc__ = staticmethod(run), tuple(inputs), description  # type: ignore[attr-defined]
     return call
@@ -212,7 +219,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "relight-views": _stage(
         relight_views.run,
         relight_views.Config,
-        "Draw relit samples of every photograph; the model is a folder, or the word embedded.",
+        "Draw relit samples of every photograph; the model is a folder, or the word embedded or dilightnet.",
         {"capture": Path, "cues": Path, "model": str},
     ),
     "fit-latent-nerf": _stage(
@@ -241,6 +248,13 @@ COMMANDS: dict[str, Callable[..., Any]] = {
         "Train a relighting diffusion model on rendered pairs.",
         {"pairs": Path, "heldout": Path},
     ),
+    "train-paper-rdm": _stage(
+        train_relighting_model.run,
+        train_relighting_model.Config,
+        "Train the paper's control on the frozen base --control.base: train-rdm with the paper's settings.",
+        {"pairs": Path, "heldout": Path},
+        train_relighting_model.Config.paper,
+    ),
     "evaluate-rdm": benchmark.relighting_model_command,
     "render-demo-capture": _stage(
         render_demo_capture.run, render_demo_capture.Config, "Render the bundled demo capture from its formulas.", {}
@@ -249,6 +263,11 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
     "benchmark": {"tensoir": benchmark.tensoir_command},
     "data": {"preview": preview_command, "download-objaverse": download_objaverse_command},
+    "models": {
+        "list": models.list_command,
+        "info": models.info_command,
+        "download": models.download_command,
+    },
 }
 
 
@@ -264,7 +283,7 @@ def main(arguments: list[str] | None = None) -> None:
             chosen = tyro.extras.subcommand_cli_from_dict(
                 COMMANDS,
                 prog="illuminerf",
-                description="Relight photographed objects. Also: illuminerf benchmark tensoir --help",
+                description="Relight photographed objects. Also: illuminerf benchmark --help, illuminerf models --help",
                 args=arguments,
             )
             if isinstance(chosen, StageCall):

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from illuminerf.data.capture import load_capture
+from illuminerf.diffusion.pretrained import check_model
 from illuminerf.evaluation.benchmark_rule import on_white
 from illuminerf.presets import Preset
 from illuminerf.report import write_report
@@ -67,6 +68,7 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
         UserError: bad input, or `out` was made with other settings.
     """
     _check(jobs)
+    check_model(preset.relighting_model)
     capture = import_capture.run(source, preset.capture, out / "capture")
     geometry = estimate_geometry.run(capture, preset.geometry, out / "geometry")
     _copy(geometry / "mesh.glb", out / "mesh.glb")

@@ -7,7 +7,16 @@ import torch
 
 from illuminerf.diffusion.augmentation import AugmentationConfig, make_batch
 from illuminerf.diffusion.cue_coding import encode_cues
-from illuminerf.diffusion.objective import Batch, LossWeights, anchor_loss, rescaled_products, training_loss
+from illuminerf.diffusion.objective import (
+    Batch,
+    Draws,
+    LossWeights,
+    anchor_loss,
+    rescaled_products,
+    step_totals,
+    stratified_timesteps,
+    training_loss,
+)
 from illuminerf.diffusion.training_items import load_items
 from illuminerf.diffusion.training_state import WeightAverage, learning_rate
 from illuminerf.scene.images import srgb_from_linear
@@ -70,9 +79,12 @@ def test_a_few_steps_lower_the_loss(tmp_path: Path, with_diffusion: bool) -> Non
     weights = LossWeights(diffusion=float(with_diffusion))
     losses = []
     for step in range(40):
-        generator = torch.Generator().manual_seed(step % 4)
-        batch = make_batch(items, 8, AugmentationConfig(composited_share=0.0), generator)
-        loss, parts = training_loss(model, batch, generator, weights, scale_momentum=0.1 if step < 4 else 0.0)
+        seeds = tuple(range(8 * (step % 4), 8 * (step % 4) + 8))
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        batch = make_batch(items, AugmentationConfig(composited_share=0.0), generators)
+        draws = Draws(stratified_timesteps(8, generators[0]), seeds)
+        totals = step_totals([batch], 8, weights.outside)
+        loss, parts = training_loss(model, batch, draws, totals, weights, scale_momentum=0.1 if step < 4 else 0.0)
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()

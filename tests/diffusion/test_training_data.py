@@ -14,6 +14,7 @@ from illuminerf.diffusion.augmentation import (
     stack_examples,
 )
 from illuminerf.diffusion.cue_coding import decode_cues
+from illuminerf.diffusion.objective import Batch
 from illuminerf.diffusion.relighting_scores import held_out_pairs, masked_psnr, masked_ssim, rescaled, true_composite
 from illuminerf.diffusion.training_items import diffuse_level, load_items
 from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
@@ -24,6 +25,10 @@ from illuminerf.workflow.storage import Storage
 from tests.diffusion.tiny import write_items
 
 EXACT = AugmentationConfig(composited_share=0.0)
+
+
+def drawn(items: list, count: int, config: AugmentationConfig, seed: int = 0) -> Batch:
+    return make_batch(items, config, [torch.Generator().manual_seed(100 * seed + number) for number in range(count)])
 
 
 @pytest.fixture
@@ -44,7 +49,7 @@ def relation_error(batch: object) -> float:
 
 def test_mixtures_tints_shuffles_and_flips_keep_light_transport(folder: Path) -> None:
     items = load_items(folder, 32)
-    batch = make_batch(items, 24, EXACT, torch.Generator().manual_seed(0))
+    batch = drawn(items, 24, EXACT)
     assert relation_error(batch) < 0.02
     wrong = batch._replace(coded_cues=batch.coded_cues.roll(1, 1))  # channels out of step
     assert relation_error(wrong) > 0.1
@@ -52,23 +57,21 @@ def test_mixtures_tints_shuffles_and_flips_keep_light_transport(folder: Path) ->
 
 def test_composited_materials_differ_from_the_render(folder: Path) -> None:
     items = load_items(folder, 32)
-    batch = make_batch(items, 24, AugmentationConfig(composited_share=1.0), torch.Generator().manual_seed(0))
+    batch = drawn(items, 24, AugmentationConfig(composited_share=1.0))
     assert all(torch.isfinite(tensor).all() for tensor in batch)
     assert relation_error(batch) > 0.05
 
 
 def test_same_generator_same_batch(folder: Path) -> None:
     items = load_items(folder, 32)
-    batches = [make_batch(items, 4, AugmentationConfig(), torch.Generator().manual_seed(s)) for s in (3, 3, 4)]
+    batches = [drawn(items, 4, AugmentationConfig(), seed) for seed in (3, 3, 4)]
     assert all(torch.equal(a, b) for a, b in zip(batches[0], batches[1], strict=True))
     assert not torch.equal(batches[0].target, batches[2].target)
 
 
 def test_input_and_target_come_from_different_lights(folder: Path) -> None:
     items = load_items(folder, 32)
-    batch = make_batch(
-        items, 16, AugmentationConfig(mixture_share=0.0, composited_share=0.0, exposure=0.0), torch.Generator()
-    )
+    batch = drawn(items, 16, AugmentationConfig(mixture_share=0.0, composited_share=0.0, exposure=0.0))
     difference = (batch.masked_image[:, :3] - batch.target).abs().amax((1, 2, 3))
     assert (difference > 0.01).all()
 

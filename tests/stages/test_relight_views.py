@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from illuminerf.data.capture import write_capture
+from illuminerf.diffusion.pretrained import save_relighter
 from illuminerf.diffusion.relighting_model import save_model
 from illuminerf.scene.cameras import Cameras, look_at
 from illuminerf.scene.images import read_png, write_exr
@@ -15,6 +16,7 @@ from illuminerf.stages import relight_views
 from illuminerf.stages.relight_views import Config, sample_path
 from illuminerf.workflow.errors import UserError
 from tests.diffusion.tiny import tiny_model, with_noise_in_every_weight
+from tests.diffusion.tiny_base import tiny_controlled, write_base
 
 SIZE = 40  # not a multiple of the model's 32
 CONFIG = Config(num_samples=2, num_steps=2, batch_size=2, device="cpu")
@@ -86,6 +88,46 @@ def test_detail_of_the_photograph_survives(inputs: tuple[Path, Path, Path], tmp_
     assert same > 0.5
     enlarged = _blurred(photograph[..., :3])
     assert np.corrcoef(detail[inside].ravel(), (enlarged - _blurred(enlarged))[inside].ravel())[0, 1] < same
+
+
+def test_shares_make_what_one_process_makes(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    settings = Config(**{**vars(CONFIG), "batch_size": 1})
+    whole = samples(relight_views.run(*inputs, settings, tmp_path / "whole"))
+    out = tmp_path / "shared"
+    for shard in ("1/2", "0/2"):
+        assert not (out / "DONE").exists()
+        relight_views.run(*inputs, Config(**{**vars(settings), "shard": shard}), out)
+    assert samples(out) == whole
+    assert (out / "DONE").exists()
+    assert (out / "DONE").read_bytes() == (tmp_path / "whole" / "DONE").read_bytes()
+    relight_views.run(*inputs, settings, out)  # finished, whoever asks
+    with pytest.raises(UserError, match="0/4"):
+        Config(shard="4/4")
+
+
+def test_torchrun_shares_the_work(
+    inputs: tuple[Path, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = Config(**{**vars(CONFIG), "batch_size": 1})
+    for rank in (0, 1):
+        monkeypatch.setenv("RANK", str(rank))
+        monkeypatch.setenv("WORLD_SIZE", "2")
+        relight_views.run(*inputs, settings, tmp_path / "out")
+        assert len(samples(tmp_path / "out")) == (4, 6)[rank]
+
+
+def test_a_model_on_a_base_and_bfloat16(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    base = write_base(tmp_path / "base")
+    model = with_noise_in_every_weight(tiny_controlled(base))  # type: ignore[arg-type]
+    save_relighter(model, tmp_path / "controlled")
+    runs = {}
+    for precision in ("float32", "bfloat16"):
+        config = Config(num_samples=2, num_steps=2, batch_size=2, samples_at_once=1, precision=precision, device="cpu")  # type: ignore[arg-type]
+        out = relight_views.run(inputs[0], inputs[1], tmp_path / "controlled", config, tmp_path / precision)
+        runs[precision] = np.stack([read_png(sample_path(out, view, k)) for view in range(3) for k in range(2)])
+    difference = np.abs(runs["float32"] - runs["bfloat16"])
+    assert difference.max() > 0 and difference.mean() < 0.02
+    assert np.abs(runs["float32"][0] - runs["float32"][1]).mean() > difference.mean()
 
 
 def _blurred(image: np.ndarray) -> np.ndarray:

@@ -5,13 +5,14 @@ pair of cues and target. Further: one RGB permutation for everything, mirror ima
 composited from the cues (not exact, so only a share of the examples, never for evaluation).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from illuminerf.diffusion.cue_coding import encode_cues
+from illuminerf.diffusion.cue_coding import CueCoding, code_cues
 from illuminerf.diffusion.objective import Batch
 from illuminerf.diffusion.training_items import TrainingItem, diffuse_level
 from illuminerf.scene.images import srgb_from_linear
@@ -43,22 +44,26 @@ class AugmentationConfig:
 
 
 def make_batch(
-    items: list[TrainingItem], batch_size: int, config: AugmentationConfig, generator: torch.Generator
+    items: list[TrainingItem],
+    config: AugmentationConfig,
+    generators: Sequence[torch.Generator],
+    coding: CueCoding = "power",
 ) -> Batch:
-    """Draw `batch_size` examples; the same generator state gives the same batch."""
+    """Draw one example per generator, each from its own alone."""
     examples = []
-    for _ in range(batch_size):
+    for generator in generators:
         item = items[_integer(len(items), generator)]
         albedo_item = items[_integer(len(items), generator)]
         examples.append(_example(item, albedo_item, config, generator))
-    return stack_examples(examples)
+    return stack_examples(examples, coding)
 
 
-def stack_examples(examples: list[tuple[Tensor, Tensor, Tensor, Tensor]]) -> Batch:
+def stack_examples(examples: list[tuple[Tensor, Tensor, Tensor, Tensor]], coding: CueCoding = "power") -> Batch:
     """(linear input, linear cues, linear target, alpha) per example to a coded batch in channels-last layout."""
     image, cues, target, alpha = (torch.stack(parts) for parts in zip(*examples, strict=True))
     masked = torch.cat([srgb_from_linear(image).clamp_max(1) * alpha, alpha], 1)
-    tensors = (masked, encode_cues(cues), srgb_from_linear(target).clamp_max(1) * alpha, alpha)
+    coded = code_cues(cues, alpha, coding)
+    tensors = (masked, coded, srgb_from_linear(target).clamp_max(1) * alpha, alpha)
     return Batch(*(tensor.contiguous(memory_format=torch.channels_last) for tensor in tensors))
 
 

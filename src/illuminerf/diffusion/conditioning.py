@@ -72,6 +72,8 @@ class ConditioningConfig:
     """ConvNet 3 (second table)."""
     text_length: int = 77
     """Tokens of the text encoder, to which ConvNet 1's are zero-padded."""
+    hears_text: bool = False
+    """The control attends to the text in place of ConvNet 1's tokens (DiLightNet; not in the paper)."""
 
 
 class Condition(NamedTuple):
@@ -209,7 +211,7 @@ class Conditioning(nn.Module):
     def __init__(self, config: ConditioningConfig) -> None:
         super().__init__()
         self.config = config
-        self.tokens = ConvPyramid(NUM_IMAGE_CHANNELS, config.tokens)
+        self.tokens = None if config.hears_text else ConvPyramid(NUM_IMAGE_CHANNELS, config.tokens)
         self.texture = TextureNetwork(config.texture)
         self.embedding = ConvPyramid(NUM_CUE_CHANNELS, config.embedding)
 
@@ -225,10 +227,22 @@ class Conditioning(nn.Module):
         self,
         masked_image: Float[Tensor, "batch 4 height width"],
         coded_cues: Float[Tensor, "batch 12 height width"],
+        text: Float[Tensor, "text_length channels"] | None = None,
     ) -> Condition:
-        """Args: masked_image: sRGB over black in [0, 1], then the mask. coded_cues: as `encode_cues` gives them."""
+        """Run ConvNets 1 to 3.
+
+        Args:
+            masked_image: sRGB over black in [0, 1], then the mask.
+            coded_cues: as the model's cue coding gives them.
+            text: what the control hears where there is no ConvNet 1.
+        """
         products = self.products(masked_image, coded_cues)
-        tokens = padded_tokens(self.tokens(masked_image), self.config.text_length)
+        if self.tokens is not None:
+            tokens = padded_tokens(self.tokens(masked_image), self.config.text_length)
+        elif text is not None:
+            tokens = text.expand(len(masked_image), -1, -1)
+        else:
+            raise ValueError("without ConvNet 1 a text embedding is needed")
         return Condition(tokens, self.embedding(products), products)
 
 

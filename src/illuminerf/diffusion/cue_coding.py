@@ -4,13 +4,30 @@ Cues are radiance without an upper bound; networks want values of order one. A p
 (albedo * cue)^(1/g) = albedo^(1/g) * cue^(1/g), so ConvNet 2's elementwise multiplication can express shading exactly.
 """
 
+from typing import Literal
+
 from jaxtyping import Float
 from torch import Tensor
 
 from illuminerf.scene.images import srgb_from_linear
 
+CueCoding = Literal["power", "srgb8"]
 GAMMA = 2.2
 MAX_RADIANCE = 16.0
+
+
+def code_cues(
+    linear_cues: Float[Tensor, "*batch 12 height width"],
+    alpha: Float[Tensor, "*batch 1 height width"],
+    coding: CueCoding,
+) -> Float[Tensor, "*batch 12 height width"]:
+    """Straight linear radiance as a model wants it: by `encode_cues`, or as DiLightNet's hints.
+
+    The latter are pictures: sRGB, clipped at 1, of 256 levels, and only then multiplied by alpha.
+    """
+    if coding == "power":
+        return encode_cues(linear_cues)
+    return (srgb_from_linear(linear_cues.clamp(0.0, 1.0)) * 255).round() / 255 * alpha
 
 
 def encode_cues(linear_cues: Float[Tensor, "*batch 12 height width"]) -> Float[Tensor, "*batch 12 height width"]:

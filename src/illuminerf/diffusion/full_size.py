@@ -1,8 +1,7 @@
 """Relighting at the photograph's own size with a model of a fixed, smaller one.
 
-The object is cut out as a square, as in the training renders, brought to the model's size and relit. Detail then comes
-back the way it went in: the material maps (offsets and gains on the image) and the sampled residual are smooth and are
-enlarged; the photograph and the cues, which carry the detail, are used at full size.
+The object is cut out as a square, as in the training renders, brought to the model's size and relit; how the result
+becomes an image of the photograph's size is the model's own affair (`Relighter.at_full_size`).
 """
 
 from dataclasses import dataclass
@@ -14,8 +13,9 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional
 
-from illuminerf.diffusion.cue_coding import composited_srgb, encode_cues
-from illuminerf.diffusion.relighting_model import RelightingModel
+from illuminerf.diffusion.cue_coding import code_cues
+from illuminerf.diffusion.relighter import Piece, Relighter
+from illuminerf.diffusion.resizing import resized
 from illuminerf.diffusion.sampling import Sampler, sample_decoded
 
 _MARGIN = 1.04
@@ -78,50 +78,40 @@ def put_back(
     return image
 
 
-def resized(images: Float[Tensor, "batch channels height width"], size: int) -> Tensor:
-    """Antialiased bilinear resizing to `size` x `size`."""
-    if images.shape[-1] == size:
-        return images
-    return functional.interpolate(images, (size, size), mode="bilinear", antialias=True, align_corners=False)
-
-
 @torch.inference_mode()
 def relight_photographs(
-    model: RelightingModel,
+    model: Relighter,
     photographs: list[Photograph],
     seeds: list[list[int]],
     num_steps: int = 8,
     sampler: Sampler = "ddim",
     temperature: float = 1.0,
+    samples_at_once: int = 0,
 ) -> list[Float[Tensor, "samples 3 height width"]]:
-    """Draw relit images of each photograph at its own size: sRGB over black in [0, 1]."""
-    size = model.config.image_size
+    """Draw relit images of each photograph at its own size: sRGB over black in [0, 1] (arguments as `sample_relit`)."""
+    size = model.image_size
     squares = [object_square(photograph.masked_image[3]) for photograph in photographs]
-    pieces = [
-        (cut_out(p.masked_image, square), cut_out(p.linear_cues * p.masked_image[3], square))
-        for p, square in zip(photographs, squares, strict=True)
+    images = [cut_out(p.masked_image, square) for p, square in zip(photographs, squares, strict=True)]
+    covered_cues = [
+        cut_out(p.linear_cues * p.masked_image[3], square) for p, square in zip(photographs, squares, strict=True)
     ]
-    masked = torch.cat([resized(image[None], size) for image, _ in pieces])
+    masked = torch.cat([resized(image[None], size) for image in images])
     alpha = masked[:, 3:].clamp_min(_LEAST_COVERAGE)
-    cues = torch.cat([resized(cues[None], size) for _, cues in pieces]) / alpha
-    coded = encode_cues(cues * (masked[:, 3:] > _LEAST_COVERAGE))
+    cues = torch.cat([resized(cues[None], size) for cues in covered_cues]) / alpha
+    coded = code_cues(cues * (masked[:, 3:] > _LEAST_COVERAGE), masked[:, 3:], model.cue_coding)
     masked = masked.contiguous(memory_format=torch.channels_last)
     coded = coded.contiguous(memory_format=torch.channels_last)
 
     condition = model.condition(masked, coded)
-    decoded = sample_decoded(model, condition, seeds, num_steps, sampler, temperature)
-    maps = model.conditioning.texture.maps(masked)
+    decoded = sample_decoded(model, condition, seeds, num_steps, sampler, temperature, samples_at_once)
+    pieces = [
+        Piece(image, cut_out(p.linear_cues, square))
+        for p, image, square in zip(photographs, images, squares, strict=True)
+    ]
     results = []
-    for index, (photograph, square) in enumerate(zip(photographs, squares, strict=True)):
-        piece, side = pieces[index][0][None], square[2]
-        relit = resized(decoded[index], side)
-        if model.config.latent_is_residual:
-            linear = cut_out(photograph.linear_cues, square)[None]
-            texture = model.conditioning.texture.texture(resized(maps[index : index + 1], side), piece[:, :3])
-            relit = relit + composited_srgb(texture * encode_cues(linear)).clamp_max(1) * piece[:, 3:]
-        else:
-            relit = (relit + 1) / 2
-        height, width = photograph.masked_image.shape[1:]
-        relit = torch.minimum(relit.clamp_min(0), piece[:, 3:])
-        results.append(torch.stack([put_back(image, square, height, width) for image in relit]))
+    for index, relit in enumerate(model.at_full_size(decoded, masked, pieces)):
+        height, width = photographs[index].masked_image.shape[1:]
+        # Over black no value exceeds the coverage.
+        relit = torch.minimum(relit.clamp_min(0), pieces[index].masked_image[None, 3:])
+        results.append(torch.stack([put_back(image, squares[index], height, width) for image in relit]))
     return results

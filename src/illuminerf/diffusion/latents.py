@@ -12,6 +12,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from illuminerf.workflow.device import full_precision
+from illuminerf.workflow.processes import sum_over_processes
+
 
 @dataclass(frozen=True)
 class PatchLatentConfig:
@@ -50,17 +53,22 @@ class PatchLatents(nn.Module):
 
     def coefficients(self, image: Float[Tensor, "batch 3 height width"]) -> Tensor:
         """The transform alone."""
-        return functional.conv2d(image, self.basis, stride=self.config.block)
+        with full_precision(image.device):
+            return functional.conv2d(image.float(), self.basis, stride=self.config.block)
 
     def decode(self, latent: Float[Tensor, "batch channels rows columns"]) -> Float[Tensor, "batch 3 height width"]:
         """Undo `encode`; frequencies that were not kept are zero."""
         coefficients = latent * self.scale[:, None, None]
-        return functional.conv_transpose2d(coefficients, self.basis, stride=self.config.block)
+        with full_precision(latent.device):
+            return functional.conv_transpose2d(coefficients.float(), self.basis, stride=self.config.block)
 
     @torch.no_grad()
     def measure(self, image: Float[Tensor, "batch 3 height width"], covered: Tensor, momentum: float) -> None:
-        """Move `scale` towards the root mean square of the coefficients over `covered` [batch, 1, rows, columns]."""
-        squares = (self.coefficients(image).square() * covered).sum((0, 2, 3)) / covered.sum().clamp_min(1.0)
+        """Move `scale` towards the root mean square of the coefficients over `covered` [batch, 1, rows, columns], of
+        all processes' images."""
+        sums = (self.coefficients(image).square() * covered).sum((0, 2, 3))
+        sums = sum_over_processes(torch.cat([sums, covered.sum()[None]]))
+        squares = sums[:-1] / sums[-1].clamp_min(1.0)
         self.scale.copy_(((1 - momentum) * self.scale.square() + momentum * squares).clamp_min(1e-6).sqrt())
 
 

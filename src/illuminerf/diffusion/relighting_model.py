@@ -21,8 +21,10 @@ from illuminerf.diffusion.conditioning import (
     PyramidConfig,
     TextureConfig,
 )
-from illuminerf.diffusion.cue_coding import composited_srgb
+from illuminerf.diffusion.cue_coding import CueCoding, composited_srgb, encode_cues
 from illuminerf.diffusion.latents import PatchLatentConfig, PatchLatents
+from illuminerf.diffusion.relighter import Piece
+from illuminerf.diffusion.resizing import resized
 from illuminerf.workflow.atomic import read_json, write_json
 from illuminerf.workflow.checkpoint import load_checkpoint, save_checkpoint
 from illuminerf.workflow.config import from_json, to_json
@@ -80,6 +82,8 @@ class RelightingModelConfig:
     def __post_init__(self) -> None:
         if self.conditioning.embedding.out_channels != self.unet.block_out_channels[0]:
             raise ValueError("ConvNet 3's output is added to ConvNet 4's, so their widths are equal")
+        if self.conditioning.hears_text:
+            raise ValueError("a base of our own knows no text, so ConvNet 1 is needed")
         if self.conditioning.tokens.out_channels != self.unet.cross_attention_dim:
             raise ValueError("ConvNet 1's output width is the cross-attention width")
 
@@ -101,6 +105,40 @@ class RelightingModel(nn.Module):
         empty = torch.zeros(config.conditioning.text_length, config.unet.cross_attention_dim)
         self.register_buffer("empty_text", empty)
 
+    @property
+    def frozen_prefixes(self) -> tuple[str, ...]:
+        """What is not trained, by the beginning of its name in the state dict: nothing."""
+        return ()
+
+    @property
+    def device(self) -> torch.device:
+        """See `Relighter`."""
+        return self.control.conv_in.weight.device
+
+    @property
+    def image_size(self) -> int:
+        """See `Relighter`."""
+        return self.config.image_size
+
+    @property
+    def cue_coding(self) -> CueCoding:
+        """See `Relighter`."""
+        return "power"
+
+    @property
+    def latent_is_residual(self) -> bool:
+        """See `Relighter`."""
+        return self.config.latent_is_residual
+
+    def noise_schedule(self) -> Any:
+        """See `Relighter`."""
+        return noise_schedule()
+
+    def latent_shape(self, height: int, width: int) -> tuple[int, int, int]:
+        """See `Relighter`."""
+        block = self.config.latents.block
+        return self.config.latents.channels, height // block, width // block
+
     def condition(
         self,
         masked_image: Float[Tensor, "batch 4 height width"],
@@ -116,6 +154,32 @@ class RelightingModel(nn.Module):
         if not self.config.latent_is_residual:
             return torch.zeros_like(condition.products[:, :3])
         return composited_srgb(condition.products).clamp_max(1.0) * alpha
+
+    def decode(self, latent: Float[Tensor, "batch channels rows columns"]) -> Float[Tensor, "batch 3 height width"]:
+        """See `Relighter`."""
+        return self.latents.decode(latent)
+
+    def at_full_size(
+        self,
+        decoded: Float[Tensor, "batch samples 3 height width"],
+        masked_image: Float[Tensor, "batch 4 height width"],
+        pieces: list[Piece],
+    ) -> list[Float[Tensor, "samples 3 side side"]]:
+        """Detail comes back the way it went in: the material maps (offsets and gains on the image) and the sampled
+        residual are smooth and are enlarged; photograph and cues, which carry the detail, are used at full size."""
+        maps = self.conditioning.texture.maps(masked_image)
+        results = []
+        for index, piece in enumerate(pieces):
+            image, side = piece.masked_image[None], piece.masked_image.shape[-1]
+            relit = resized(decoded[index], side)
+            if self.config.latent_is_residual:
+                texture = self.conditioning.texture.texture(resized(maps[index : index + 1], side), image[:, :3])
+                products = texture * encode_cues(piece.linear_cues[None])
+                relit = relit + composited_srgb(products).clamp_max(1) * image[:, 3:]
+            else:
+                relit = (relit + 1) / 2
+            results.append(relit)
+        return results
 
     def forward(
         self, noisy_latent: Tensor, timesteps: Int[Tensor, " batch"], condition: Condition

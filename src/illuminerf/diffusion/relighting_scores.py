@@ -3,14 +3,16 @@
 The scale (least squares in linear light) takes out what a single image cannot tell: albedo against exposure.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
 from illuminerf.diffusion.augmentation import interpolated_specular, plain_example, stack_examples
-from illuminerf.diffusion.cue_coding import decode_cues
-from illuminerf.diffusion.relighting_model import RelightingModel
+from illuminerf.diffusion.cue_coding import decode_cues, encode_cues
+from illuminerf.diffusion.relighter import Relighter
 from illuminerf.diffusion.sampling import Sampler, sample_relit
 from illuminerf.diffusion.training_items import TrainingItem
 from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
@@ -60,13 +62,24 @@ def masked_ssim(
 
 
 def held_out_pairs(items: list[TrainingItem], num_pairs: int) -> list[tuple[TrainingItem, int, int]]:
-    """Deterministic (item, input light, target light), spread over items and lights."""
-    pairs = []
-    for index in range(num_pairs):
-        item = items[(index * max(1, len(items) // num_pairs)) % len(items)]
-        lights = len(item.targets)
-        first = index % lights
-        pairs.append((item, first, (first + 1 + (index // lights) % (lights - 1)) % lights))
+    """Deterministic (item, input light, target light), all different, spread over items and lights.
+
+    There are fewer than `num_pairs` where the items' lights allow no more.
+    """
+    pairs: list[tuple[TrainingItem, int, int]] = []
+    stride = max(1, len(items) // num_pairs)
+    chosen = list(enumerate(items))[::stride][:num_pairs]
+    rounds = max(len(item.targets) * (len(item.targets) - 1) for item in items)
+    for index in range(len(chosen) * rounds):
+        number, item = chosen[index % len(chosen)]
+        lights, turn = len(item.targets), index // len(chosen)
+        orders = lights * (lights - 1)
+        if turn < orders and len(pairs) < num_pairs:
+            # Each turn takes another of the item's ordered pairs of lights: steps of a number prime to their count.
+            start = (number % lights) * (lights - 1) + (number // lights) % (lights - 1)
+            step = next(k for k in range(orders // 2 + 1, 2 * orders + 2) if math.gcd(k, orders) == 1)
+            first, offset = divmod((start + turn * step) % orders, lights - 1)
+            pairs.append((item, first, (first + 1 + offset) % lights))
     return pairs
 
 
@@ -80,7 +93,7 @@ def true_composite(item: TrainingItem, linear_cues: Float[Tensor, "12 height wid
 
 @torch.inference_mode()
 def evaluate(
-    model: RelightingModel,
+    model: Relighter,
     items: list[TrainingItem],
     num_pairs: int = 24,
     num_samples: int = 4,
@@ -91,36 +104,43 @@ def evaluate(
 ) -> tuple[dict[str, dict[str, float]], dict[str, Float[Tensor, "pairs 3 height width"]]]:
     """Scores by estimate ({name: {psnr, ssim}}), and the images, on held-out items.
 
-    Estimates: input (the image itself), mean_albedo (its mean albedo * diffuse cue), anchor (products alone),
-    sample (one sample, averaged), mean (mean of samples), best (best sample), bound (true materials).
+    Estimates: input (the image itself), mean_albedo (its mean albedo * diffuse cue), anchor (products alone, of
+    models that have one), sample (one sample, averaged), mean (mean of samples), best (best sample), bound (true
+    materials).
     `spread` is the samples' standard deviation over covered pixels, in sRGB.
     """
     pairs = held_out_pairs(items, num_pairs)
     examples = [plain_example(*pair) for pair in pairs]
-    batch = stack_examples(examples)
+    batch = stack_examples(examples, model.cue_coding)
+    diffuse_cues = encode_cues(torch.stack([example[1] for example in examples]))[:, :3]
     samples, anchors = [], []
     for start in range(0, len(pairs), batch_size):
-        image, cues = batch.masked_image[start : start + batch_size], batch.coded_cues[start : start + batch_size]
+        rows = slice(start, start + batch_size)
+        image, cues = batch.masked_image[rows].to(model.device), batch.coded_cues[rows].to(model.device)
         seeds = [[1000 * (start + i) + k for k in range(num_samples)] for i in range(len(image))]
-        samples.append(sample_relit(model, image, cues, seeds, num_steps, sampler, temperature))
-        anchors.append(model.anchor(model.condition(image, cues), image[:, 3:]))
+        samples.append(sample_relit(model, image, cues, seeds, num_steps, sampler, temperature).cpu())
+        if model.latent_is_residual:
+            anchors.append(model.anchor(model.condition(image, cues), image[:, 3:]).float().cpu())
     drawn = torch.cat(samples)
     bounds = [true_composite(pair[0], example[1]) for pair, example in zip(pairs, examples, strict=True)]
     images = {
         "input": batch.masked_image[:, :3],
-        "mean_albedo": _mean_albedo_estimate(batch.masked_image, decode_cues(batch.coded_cues[:, :3])),
-        "anchor": torch.cat(anchors),
+        "mean_albedo": _mean_albedo_estimate(batch.masked_image, decode_cues(diffuse_cues)),
         "mean": drawn.mean(1),
         "bound": srgb_from_linear(torch.stack(bounds)).clamp_max(1) * batch.alpha,
     }
+    if anchors:
+        images["anchor"] = torch.cat(anchors)
     truth, alpha = batch.target, batch.alpha
     scores = {name: _scores(image, truth, alpha) for name, image in images.items()}
-    each = torch.stack([masked_psnr(rescaled(drawn[:, k], truth), truth, alpha) for k in range(num_samples)])
-    scores["sample"] = {"psnr": float(each.mean())}
-    scores["best"] = {"psnr": float(each.max(0).values.mean())}
+    ours = [rescaled(drawn[:, k], truth) for k in range(num_samples)]
+    psnr = torch.stack([masked_psnr(one, truth, alpha) for one in ours])
+    ssim = torch.stack([masked_ssim(one, truth, alpha) for one in ours])
+    scores["sample"] = {"psnr": float(psnr.mean()), "ssim": float(ssim.mean())}
+    scores["best"] = {"psnr": float(psnr.max(0).values.mean()), "ssim": float(ssim.max(0).values.mean())}
     deviation = drawn.std(1) if num_samples > 1 else torch.zeros_like(truth)
     scores["spread"] = {"srgb": float((deviation * alpha).sum() / (3 * alpha.sum()))}
-    return scores, images | {"truth": truth, "sample": drawn[:, 0], "diffuse_cue": batch.coded_cues[:, :3]}
+    return scores, images | {"truth": truth, "sample": drawn[:, 0], "diffuse_cue": diffuse_cues}
 
 
 def _scores(estimate: Tensor, truth: Tensor, alpha: Tensor) -> dict[str, float]:

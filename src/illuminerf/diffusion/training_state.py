@@ -1,5 +1,7 @@
 """The state of a training run: averaged weights, learning rate, exact resume."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -11,6 +13,13 @@ from illuminerf.workflow.checkpoint import (
     restore_optimizer,
     save_checkpoint,
 )
+from illuminerf.workflow.errors import UserError
+
+
+def trained_tensors(model: nn.Module) -> dict[str, Tensor]:
+    """The model's state without what is frozen: neither averaged nor written into checkpoints."""
+    frozen: tuple[str, ...] = getattr(model, "frozen_prefixes", ())
+    return {name: value for name, value in model.state_dict().items() if not name.startswith(frozen)}
 
 
 class WeightAverage:
@@ -18,14 +27,33 @@ class WeightAverage:
 
     def __init__(self, model: nn.Module, decay: float) -> None:
         self.decay = decay
-        self.tensors = {name: value.detach().clone() for name, value in model.state_dict().items()}
+        self.tensors = {name: value.detach().clone() for name, value in trained_tensors(model).items()}
 
     @torch.no_grad()
     def update(self, model: nn.Module, step: int) -> None:
         """Move towards the model after optimisation step `step` (0, 1, ...)."""
         decay = min(self.decay, (1 + step) / (10 + step))
-        for name, value in model.state_dict().items():
+        for name, value in trained_tensors(model).items():
             self.tensors[name].lerp_(value, 1 - decay)
+
+    @contextmanager
+    def inside(self, model: nn.Module) -> Iterator[None]:
+        """Put the averages into the model, ready to sample, and take them out again, bit by bit, at the end."""
+        current = {name: value.detach().clone() for name, value in trained_tensors(model).items()}
+        was_training = model.training
+        _copy_into(model, self.tensors)
+        model.eval()
+        try:
+            yield
+        finally:
+            _copy_into(model, current)
+            model.train(was_training)
+
+
+@torch.no_grad()
+def _copy_into(model: nn.Module, tensors: dict[str, Tensor]) -> None:
+    for name, value in trained_tensors(model).items():
+        value.copy_(tensors[name])
 
 
 def learning_rate(step: int, peak: float, warm_up_steps: int, num_steps: int, final_share: float) -> float:
@@ -39,16 +67,24 @@ def save_training(
     path: Path, model: nn.Module, average: WeightAverage, optimizer: torch.optim.Optimizer, step: int
 ) -> None:
     """Write everything a run needs to go on as if never stopped; randomness derives from the step."""
-    tensors: dict[str, Tensor] = {f"model.{name}": value for name, value in model.state_dict().items()}
+    tensors: dict[str, Tensor] = {f"model.{name}": value for name, value in trained_tensors(model).items()}
     tensors |= {f"average.{name}": value for name, value in average.tensors.items()}
     save_checkpoint(path, tensors | optimizer_tensors(optimizer), {"step": step})
 
 
 def restore_training(path: Path, model: nn.Module, average: WeightAverage, optimizer: torch.optim.Optimizer) -> int:
-    """Put back what `save_training` wrote; returns the number of finished steps."""
+    """Put back what `save_training` wrote; returns the number of finished steps.
+
+    Raises:
+        UserError: the checkpoint is missing, corrupt or of another model.
+    """
     tensors, metadata = load_checkpoint(path)
-    model.load_state_dict(_under("model.", tensors))
-    average.tensors = _under("average.", tensors)
+    stored = _under("model.", tensors)
+    if {name: value.shape for name, value in stored.items()} != {k: v.shape for k, v in average.tensors.items()}:
+        raise UserError(f"{path} is of another model", fix="delete its folder and run again")
+    _copy_into(model, stored)
+    for name, value in _under("average.", tensors).items():
+        average.tensors[name].copy_(value)
     restore_optimizer(optimizer, tensors)
     _match_layouts(optimizer)
     return int(metadata["step"])

@@ -2,9 +2,13 @@
 
 samples/<000>_<00>.png   sRGB over black (premultiplied by the capture's alpha), at the capture's size
 seeds.json               the seed of every sample
+
+Several processes or machines can share the work on one folder: `--shard 0/4`, `--shard 1/4`, ..., or one torchrun.
+Whoever finds every sample in place seals the artefact.
 """
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +17,17 @@ import torch
 from illuminerf.cues.renderer import CUE_CHANNELS
 from illuminerf.data.capture import load_capture
 from illuminerf.diffusion.full_size import Photograph, relight_photographs, straight_cues
-from illuminerf.diffusion.pretrained import model_folder
-from illuminerf.diffusion.relighting_model import RelightingModel, load_model
+from illuminerf.diffusion.pretrained import model_folder, pretrained_model
+from illuminerf.diffusion.relighter import Relighter
 from illuminerf.diffusion.sampling import Sampler
 from illuminerf.scene.images import read_exr, write_png
 from illuminerf.scene.views import Views
 from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.atomic import write_json
-from illuminerf.workflow.device import derived_seed, resolve_device
+from illuminerf.workflow.device import Precision, autocast, derived_seed, resolve_device
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import step_progress
+from illuminerf.workflow.processes import shard_of
+from illuminerf.workflow.progress import say, step_progress
 
 STAGE = "relight_views"
 
@@ -41,14 +46,21 @@ class Config:
     """Factor on the initial noise. Deviation: 1 in the paper; below 1 samples differ less and fit better."""
     batch_size: int = 4
     """Views relit at once."""
+    samples_at_once: int = 0
+    """Samples of each of these views at once, to save memory; 0: all."""
+    precision: Precision = "float32"
+    """bfloat16 is faster on GPUs and recent CPUs."""
+    shard: str = ""
+    """Share of the work that this process does, i/n from 0/n; "": all, or what torchrun says. Changes no result."""
     device: str = "auto"
     """Where it runs: auto, cpu or cuda."""
     seed: int = 0
     """A sample's noise derives from it, the view and the sample's number."""
 
     def __post_init__(self) -> None:
-        if min(self.num_samples, self.num_steps, self.batch_size) < 1:
-            raise UserError("num_samples, num_steps and batch_size must be at least 1")
+        if min(self.num_samples, self.num_steps, self.batch_size) < 1 or self.samples_at_once < 0:
+            raise UserError("num_samples, num_steps and batch_size must be at least 1, samples_at_once not negative")
+        shard_of(self.shard)
         if not 0 <= self.temperature <= 2:
             raise UserError("temperature must lie in [0, 2]", got=str(self.temperature))
         if self.num_samples > 100 or self.num_steps > 1000:
@@ -61,7 +73,7 @@ def run(capture: Path, cues: Path, model: Path | str, config: Config, out: Path)
     Args:
         capture: a Capture artefact.
         cues: a RadianceCues artefact of the same views.
-        model: a RelightingModel folder, or "embedded" for the one inside the package.
+        model: a RelightingModel folder, "embedded" for the one inside the package, or "dilightnet" once downloaded.
         config: the settings.
         out: the artefact's folder.
 
@@ -69,7 +81,10 @@ def run(capture: Path, cues: Path, model: Path | str, config: Config, out: Path)
         UserError: an input is missing or does not fit the others.
     """
     folder = model_folder(model)
-    with open_artefact(out, STAGE, config, {"capture": capture, "cues": cues, "model": folder}) as artefact:
+    shard, num_shards = shard_of(config.shard)
+    inputs: dict[str, Path | str] = {"capture": capture, "cues": cues, "model": folder}
+    keyed = replace(config, shard="")
+    with open_artefact(out, STAGE, keyed, inputs, is_shared=num_shards > 1) as artefact:
         if artefact.is_done:
             return out
         views = load_capture(capture).views
@@ -80,14 +95,14 @@ def run(capture: Path, cues: Path, model: Path | str, config: Config, out: Path)
         write_json(out / "seeds.json", {f"{view:03d}": row for view, row in seeds.items()})
         # A batch is redone whole: convolutions round differently in batches of another size.
         batches = [list(seeds)[start : start + config.batch_size] for start in range(0, len(seeds), config.batch_size)]
-        todo = [batch for batch in batches if not _is_relit(out, batch, config.num_samples)]
-        device = resolve_device(config.device)
-        network = load_model(folder, device)
-        with step_progress("relight views", len(views), len(views) - sum(map(len, todo))) as progress:
-            for batch in todo:
-                _relight(network, views, cues, batch, [seeds[view] for view in batch], config, out)
-                progress.advance(len(batch))
-        artefact.finish({"num_views": len(views), "num_samples": config.num_samples})
+        ours = batches[shard::num_shards]
+        todo = [batch for batch in ours if not _is_relit(out, batch, config.num_samples)]
+        if todo:
+            _relight_all(folder, views, cues, ours, todo, seeds, config, out)
+        if _is_relit(out, list(seeds), config.num_samples):
+            artefact.finish({"num_views": len(views), "num_samples": config.num_samples})
+        else:
+            say(f"share {shard}/{num_shards} is done; others are not yet")
     return out
 
 
@@ -100,18 +115,48 @@ def _is_relit(out: Path, batch: list[int], num_samples: int) -> bool:
     return all(sample_path(out, view, k).exists() for view in batch for k in range(num_samples))
 
 
+def _relight_all(
+    folder: Path,
+    views: Views,
+    cues: Path,
+    ours: list[list[int]],
+    todo: list[list[int]],
+    seeds: dict[int, list[int]],
+    config: Config,
+    out: Path,
+) -> None:
+    device = resolve_device(config.device)
+    if device == torch.device("cuda"):  # under a launcher each process has a GPU of its own
+        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+    network = pretrained_model(folder, device)
+    num_views = sum(map(len, ours))
+    with step_progress("relight views", num_views, num_views - sum(map(len, todo))) as progress:
+        for batch in todo:
+            with autocast(device, config.precision):
+                _relight(network, views, cues, batch, [seeds[view] for view in batch], config, out, device)
+            progress.advance(len(batch))
+
+
 def _relight(
-    network: RelightingModel,
+    network: Relighter,
     views: Views,
     cues: Path,
     batch: list[int],
     seeds: list[list[int]],
     config: Config,
     out: Path,
+    device: torch.device,
 ) -> None:
-    device = next(network.parameters()).device
     photographs = [_photograph(views, view, cues, device) for view in batch]
-    relit = relight_photographs(network, photographs, seeds, config.num_steps, config.sampler, config.temperature)
+    relit = relight_photographs(
+        network,
+        photographs,
+        seeds,
+        config.num_steps,
+        config.sampler,
+        config.temperature,
+        config.samples_at_once,
+    )
     for view, samples in zip(batch, relit, strict=True):
         for sample, image in enumerate(samples):
             write_png(sample_path(out, view, sample), image.permute(1, 2, 0).cpu().numpy())

@@ -48,7 +48,9 @@ class Artefact:
 
 
 @contextmanager
-def open_artefact(out: Path, stage: str, config: Any, inputs: dict[str, Path | str]) -> Iterator[Artefact]:
+def open_artefact(
+    out: Path, stage: str, config: Any, inputs: dict[str, Path | str], is_shared: bool = False
+) -> Iterator[Artefact]:
     """Open `out` for `stage`: to load (`is_done`), to go on, or to start.
 
     Args:
@@ -56,6 +58,8 @@ def open_artefact(out: Path, stage: str, config: Any, inputs: dict[str, Path | s
         stage: the stage's name, for example "estimate_geometry".
         config: the stage's frozen dataclass.
         inputs: by role, the paths this artefact is made from (artefact folders or files), or literal strings.
+        is_shared: several processes work on it at once, each on units of its own; whoever finds everything in place
+            calls `finish`.
 
     Raises:
         UserError: the folder was made by another stage, config or input, or another process is working on it.
@@ -67,14 +71,18 @@ def open_artefact(out: Path, stage: str, config: Any, inputs: dict[str, Path | s
     if is_done:
         yield Artefact(out, stage, is_done=True, finished=True)
         return
-    with locked(out):
-        remove_partial_files(out)
+    with locked(out, is_shared) as lock:
+        if not is_shared:  # else they may be another process's, just being written
+            remove_partial_files(out)
         write_json(out / "config.json", key)
         write_json(out / "inputs.json", made_from)
         artefact = Artefact(out, stage, is_done=False)
         start = time.monotonic()
         yield artefact
-        if artefact.finished:
+        if artefact.finished and is_shared:
+            _wait_for_others(lock)
+            remove_partial_files(out)
+        if artefact.finished and not (out / "DONE").exists():
             _seal(artefact, seconds=time.monotonic() - start)
 
 
@@ -205,8 +213,9 @@ def _file_digest(path: Path) -> str:
 
 
 @contextmanager
-def locked(out: Path) -> Iterator[None]:
-    """Keep two processes from working on one artefact; the kernel drops the lock when a process dies."""
+def locked(out: Path, is_shared: bool = False) -> Iterator[int]:
+    """Keep two processes from working on one artefact, unless both share it; the kernel drops the lock when a process
+    dies."""
     import fcntl
 
     try:
@@ -216,14 +225,21 @@ def locked(out: Path) -> Iterator[None]:
         raise UserError(f"{out} cannot be written", got=str(error.strerror), fix="choose another --out") from error
     try:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise UserError(
                 f"another process is working on {out}", fix="wait for it or choose another --out"
             ) from error
-        yield
+        yield handle
     finally:
         os.close(handle)
+
+
+def _wait_for_others(lock: int) -> None:
+    """Turn a shared lock into one's own: everything is in place, so the others are about to leave."""
+    import fcntl
+
+    fcntl.flock(lock, fcntl.LOCK_EX)
 
 
 def _version(name: str) -> str:

@@ -1,6 +1,8 @@
 """Where things run and where randomness comes from."""
 
 import hashlib
+from contextlib import AbstractContextManager, nullcontext
+from typing import Literal
 
 import numpy as np
 import torch
@@ -27,6 +29,21 @@ def resolve_device(name: str) -> torch.device:
             )
         return torch.device(name)
     raise UserError("unknown device", got=repr(name), wanted="auto, cpu or cuda")
+
+
+Precision = Literal["float32", "bfloat16"]
+
+
+def autocast(device: torch.device, precision: Precision) -> AbstractContextManager[object]:
+    """Run matrix products and convolutions in bfloat16 where that is asked for; weights stay float32."""
+    if precision == "float32":
+        return nullcontext()
+    return torch.autocast(device.type, torch.bfloat16)
+
+
+def full_precision(device: torch.device) -> AbstractContextManager[object]:
+    """No autocast inside, for the few operations whose results are targets or images."""
+    return nullcontext() if device.type == "meta" else torch.autocast(device.type, enabled=False)
 
 
 def derived_seed(seed: int, *names: object) -> int:

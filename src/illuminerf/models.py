@@ -1,0 +1,78 @@
+"""`illuminerf models`: which relighting models there are, what they consist of, and fetching published weights."""
+
+from pathlib import Path
+
+import tyro
+from rich.table import Table
+
+from illuminerf.diffusion.hub import KNOWN, KnownModel, download, models_home, repository_folder
+from illuminerf.diffusion.model_tables import layer_tables, model_on_meta, parameter_counts
+from illuminerf.diffusion.pretrained import EMBEDDED, model_folder
+from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.progress import console, say
+
+
+def list_command() -> None:
+    """List the relighting models: what each is for, its size, and where it is on this machine."""
+    table = Table(title=f"Relighting models (downloads go to {models_home()})")
+    for column in ("name", "what for", "size", "local", "path"):
+        table.add_column(column, overflow="fold")
+    for model in KNOWN.values():
+        folders, missing = _places(model)
+        where = "yes" if not missing else f"{len(missing)} files missing"
+        table.add_row(model.name, model.purpose, model.size, where, ", ".join(map(str, folders)))
+    console.print(table)
+
+
+def info_command(name: tyro.conf.Positional[str]) -> None:
+    """Parameters by module, the layers of the condition networks, and the licence, without reading any weights.
+
+    Args:
+        name: embedded, dilightnet or paper.
+    """
+    model = model_on_meta(name)
+    say(f"[bold]{name}[/bold]: {KNOWN[name].purpose}; licence: {KNOWN[name].licence}")
+    counts = Table(title="Parameters")
+    counts.add_column("module")
+    counts.add_column("parameters", justify="right")
+    for part, count in parameter_counts(model).items():
+        counts.add_row(part, f"{count:,}")
+    console.print(counts)
+    for network, rows in layer_tables(model).items():
+        table = Table(title=f"{network} at {model.image_size}x{model.image_size}")
+        table.add_column("layer (kernel, stride, padding)")
+        table.add_column("output")
+        for layer in rows:
+            table.add_row(layer.kind, " x ".join(map(str, layer.shape)))
+        console.print(table)
+
+
+def download_command(name: tyro.conf.Positional[str], base: str = "", revision: str = "") -> None:
+    """Fetch published weights from the Hugging Face hub: safetensors and JSON only, checked where sums are known.
+
+    Args:
+        name: dilightnet, or paper for a base to train on.
+        base: Another base than SD 2.1, by its id on the hub; for paper.
+        revision: Another commit or branch than the pinned one.
+    """
+    if name == EMBEDDED:
+        say("embedded ships with the package; nothing to download")
+        return
+    for folder in download(name, base, revision):
+        say(f"done: {folder}")
+
+
+def _places(model: KnownModel) -> tuple[list[Path], list[Path]]:
+    """(the model's folders, files that are missing from them)."""
+    if model.name == EMBEDDED:
+        try:
+            return [model_folder(EMBEDDED)], []
+        except UserError:
+            return [], [Path("relighting_model.json")]
+    folders = [repository_folder(repository.id) for repository in model.repositories]
+    wanted = [
+        folder / file.path
+        for folder, repository in zip(folders, model.repositories, strict=True)
+        for file in repository.files
+    ]
+    return folders, [path for path in wanted if not path.is_file()]
