@@ -1,6 +1,7 @@
 """Relit samples: resumable, seeded, at the capture's size, black off the object."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,15 +9,19 @@ import pytest
 import torch
 
 from illuminerf.data.capture import write_capture
+from illuminerf.diffusion.hub import repository_folder
 from illuminerf.diffusion.pretrained import save_relighter
 from illuminerf.diffusion.relighting_model import save_model
+from illuminerf.presets import PRESETS
 from illuminerf.scene.cameras import Cameras, look_at
 from illuminerf.scene.images import read_png, write_exr
 from illuminerf.stages import relight_views
 from illuminerf.stages.relight_views import Config, sample_path
+from illuminerf.workflow.atomic import write_json
+from illuminerf.workflow.config import to_json
 from illuminerf.workflow.errors import UserError
 from tests.diffusion.tiny import tiny_model, with_noise_in_every_weight
-from tests.diffusion.tiny_base import tiny_controlled, write_base
+from tests.diffusion.tiny_base import tiny_config, tiny_controlled, write_base, write_published
 
 SIZE = 40  # not a multiple of the model's 32
 CONFIG = Config(num_samples=2, num_steps=2, batch_size=2, device="cpu")
@@ -128,6 +133,22 @@ def test_a_model_on_a_base_and_bfloat16(inputs: tuple[Path, Path, Path], tmp_pat
     difference = np.abs(runs["float32"] - runs["bfloat16"])
     assert difference.max() > 0 and difference.mean() < 0.02
     assert np.abs(runs["float32"][0] - runs["float32"][1]).mean() > difference.mean()
+
+
+def test_the_published_weights_relight_by_their_name(
+    inputs: tuple[Path, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ILLUMINERF_MODELS", str(tmp_path / "models"))
+    folder = repository_folder("dilightnet/DiLightNet")
+    base = write_base(tmp_path / "base", prediction_type="v_prediction")
+    write_published(folder, base)
+    write_json(folder / "relighting_model.json", to_json(tiny_config(base, cue_coding="srgb8")))
+    config = replace(PRESETS["dilightnet"].relighting, num_samples=2, num_steps=2, device="cpu")
+    out = relight_views.run(inputs[0], inputs[1], "dilightnet", config, tmp_path / "out")
+    images = [read_png(sample_path(out, 1, k)) for k in range(2)]
+    alpha = read_png(inputs[0] / "images" / "001.png")[..., 3]
+    assert images[0].shape == (SIZE, SIZE, 3) and (images[0][alpha == 0] == 0).all()
+    assert np.abs(images[0] - images[1]).max() > 0.02
 
 
 def _blurred(image: np.ndarray) -> np.ndarray:

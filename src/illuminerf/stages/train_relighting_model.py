@@ -56,7 +56,7 @@ def run(pairs: Path, held_out: Path, config: Config, out: Path) -> Path:
         UserError: a folder holds no items, the device or the base is absent, or a step cannot be split evenly.
     """
     resolve_device(config.device)
-    unused = DistributedDataParallelKwargs(find_unused_parameters=not config.control.base, broadcast_buffers=False)
+    unused = DistributedDataParallelKwargs(find_unused_parameters=not config.control.base)
     accelerator = Accelerator(cpu=config.device == "cpu", kwargs_handlers=[unused])
     inputs: dict[str, Path | str] = {"pairs": str(pairs), "held_out": str(held_out)}
     if not accelerator.is_main_process:
@@ -225,9 +225,9 @@ class _Training:
         grid = torch.cat(rows, 1).permute(1, 2, 0).cpu().numpy()
         write_png(self.out / "validation" / f"{step:06d}.png", grid)
         write_json(self.out / "validation" / f"{step:06d}.json", {"step": step, "size": phase.size, "scores": scores})
+        psnr = {name: score["psnr"] for name, score in scores.items() if "psnr" in score}
         if self.log is not None:
-            psnr = {name: score["psnr"] for name, score in scores.items() if "psnr" in score}
             self.log.write("validation", step, psnr)
             self.log.picture("held-out", step, grid)
-        say(f"step {step}: " + json.dumps({name: round(s.get("psnr", 0), 2) for name, s in scores.items()}))
+        say(f"step {step}, PSNR: " + json.dumps({name: round(value, 2) for name, value in psnr.items()}))
         return scores
