@@ -189,6 +189,14 @@ def test_samplers_find_a_known_point_from_its_noise(base: Path, sampler: Sampler
     torch.testing.assert_close(latent, point, atol=0.01, rtol=0)
 
 
+def test_a_base_with_eight_latent_channels_as_in_the_paper(tmp_path: Path) -> None:
+    model = tiny_controlled(write_base(tmp_path, latent_channels=8))
+    assert model.latent_shape(512, 512) == (8, 64, 64)
+    assert model.control.conv_in.weight.shape[:2] == (16, 8)
+    image, cues = random_condition_inputs(1, 32)
+    assert torch.isfinite(sample_relit(model, image, cues, [[0]], 2)).all()
+
+
 def test_both_kinds_relight_photographs(base: Path) -> None:
     model = with_noise_in_every_weight(tiny_controlled(base))  # type: ignore[arg-type]
     image, cues = torch.rand(4, 40, 44), torch.rand(12, 40, 44)

@@ -6,9 +6,10 @@ import pytest
 import torch
 from diffusers import ControlNetModel
 
+from illuminerf.diffusion.conditioning import Conditioning
 from illuminerf.diffusion.controlled_base import ControlledBase
 from illuminerf.diffusion.cue_coding import code_cues
-from illuminerf.diffusion.dilightnet import DILIGHTNET, is_published, published_config
+from illuminerf.diffusion.dilightnet import DILIGHTNET, is_published, published_config, renamed_conditioning
 from illuminerf.diffusion.hub import DILIGHTNET_CONTROL, SD21, repository_folder
 from illuminerf.diffusion.pretrained import model_folder, pretrained_model, save_relighter
 from illuminerf.diffusion.sampling import sample_relit
@@ -63,6 +64,18 @@ def test_the_whole_prediction_is_diffusers_own(published: tuple[Path, PublishedE
     ).sample
     torch.testing.assert_close(model(latent, step, model.condition(image, cues)), expected, atol=1e-5, rtol=1e-5)
     assert (model.base.unet(latent, step, text).sample - expected).abs().max() > 1e-2
+
+
+def test_the_published_names_and_shapes_fit_at_full_size() -> None:
+    with torch.device("meta"):
+        published = PublishedEmbedding((32, 64, 128), (16, 32, 96, 256), 320)
+        wanted = Conditioning(DILIGHTNET.conditioning).state_dict()
+    prefixed = {f"controlnet_cond_embedding.{name}": value for name, value in published.state_dict().items()}
+    renamed = renamed_conditioning(prefixed)
+    assert {k: v.shape for k, v in renamed.items()} == {k: v.shape for k, v in wanted.items()}
+    assert (
+        len(renamed) == len(prefixed) == 2 * (14 + 8 + 8)
+    )  # convolutions and norms of ConvNet 2, convolutions of ConvNet 3
 
 
 def test_hints_are_8_bit_pictures_over_black() -> None:

@@ -65,16 +65,17 @@ def text_encoder(hidden_act: str = "gelu") -> tuple[dict[str, Any], dict[str, to
     return config, weights
 
 
-def write_base(folder: Path, prediction_type: str = "epsilon") -> Path:
+def write_base(folder: Path, prediction_type: str = "epsilon", latent_channels: int = 4) -> Path:
     torch.manual_seed(0)
     unet = UNet2DConditionModel(
-        sample_size=4, in_channels=4, out_channels=4, block_out_channels=(16, 16), layers_per_block=1,
+        sample_size=4, in_channels=latent_channels, out_channels=latent_channels, layers_per_block=1,
+        block_out_channels=(16, 16),
         down_block_types=("CrossAttnDownBlock2D", "DownBlock2D"), up_block_types=("UpBlock2D", "CrossAttnUpBlock2D"),
         cross_attention_dim=WIDTH, attention_head_dim=2, norm_num_groups=4, use_linear_projection=True,
     )  # fmt: skip
     vae = AutoencoderKL(
         block_out_channels=(8, 8, 8, 8), down_block_types=("DownEncoderBlock2D",) * 4, norm_num_groups=4,
-        up_block_types=("UpDecoderBlock2D",) * 4, latent_channels=4, layers_per_block=1,
+        up_block_types=("UpDecoderBlock2D",) * 4, latent_channels=latent_channels, layers_per_block=1,
     )  # fmt: skip
     for name, network in (("unet", unet), ("vae", vae)):
         network.save_config(folder / name)
