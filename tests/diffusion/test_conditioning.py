@@ -11,6 +11,7 @@ from illuminerf.diffusion.conditioning import (
     ConditioningConfig,
     ConvPyramid,
     PyramidConfig,
+    SelfAttention,
     TextureConfig,
     TextureNetwork,
     padded_tokens,
@@ -48,7 +49,7 @@ def test_convnet_2_has_dilightnets_layers() -> None:
     with torch.device("meta"):
         network = TextureNetwork(TextureConfig())
         convolutions = [m for m in network.modules() if isinstance(m, nn.Conv2d | nn.ConvTranspose2d)]
-        assert network(torch.empty(1, 4, 512, 512)).shape == (1, 12, 512, 512)
+        assert network(torch.empty(1, 4, 512, 512), torch.empty(1, 12, 512, 512)).shape == (1, 12, 512, 512)
     found = [(m.in_channels, m.out_channels, m.kernel_size[0], m.stride[0]) for m in convolutions]
     block = [(128, 128, 3, 1)] * 2
     wanted = [(4, 32, 3, 1), (32, 64, 3, 2), (64, 128, 3, 2), *block * 4]
@@ -88,15 +89,15 @@ def test_flax_default_initialisation_has_variance_one_over_fan_in() -> None:
 
 
 def test_products_are_texture_times_cues_elementwise() -> None:
-    for config in (TINY.conditioning, ConditioningConfig(PyramidConfig((8, 8), 16), TextureConfig((8, 8, 8), 1))):
+    for config in (TINY.conditioning, ConditioningConfig(PyramidConfig((8, 8, 8), 16, 4), TextureConfig((8, 8, 8), 1))):
         conditioning = Conditioning(config)
         image, cues = random_condition_inputs(2, 32)
-        products = conditioning.products(image, cues)
-        torch.testing.assert_close(products, conditioning.texture(image) * cues)
-        assert (conditioning.products(image, 0 * cues) == 0).all()
+        products = conditioning(image, cues).products
+        torch.testing.assert_close(products, conditioning.texture(image, cues) * cues)
+        assert (conditioning(image, 0 * cues).products == 0).all()
         changed = cues.clone()
         changed[:, 5, 3, 4] += 1
-        difference = (conditioning.products(image, changed) - products).abs()
+        difference = (conditioning(image, changed).products - products).abs()
         assert difference[:, 5, 3, 4].min() > 0
         difference[:, 5, 3, 4] = 0
         assert difference.max() == 0
@@ -106,10 +107,39 @@ def test_material_texture_starts_as_a_dim_copy_and_is_never_negative() -> None:
     torch.manual_seed(0)
     network = TextureNetwork(TextureConfig((8, 8, 16), 1, patch=4, is_material=True))
     image = torch.rand(1, 4, 32, 32)
-    texture = network(image)
+    texture = network(image, torch.zeros(1, 12, 32, 32))
     assert (texture >= 0).all()
     assert (texture[:, :3] - (0.2 + 0.6 * image[:, :3])).abs().mean() < 0.15
     assert texture[:, 3:].mean() < 0.1
+
+
+@pytest.mark.parametrize("sees_cues", [False, True])
+def test_cues_reach_the_texture_only_where_it_sees_them(sees_cues: bool) -> None:
+    torch.manual_seed(0)
+    config = TextureConfig((8, 8, 32), 2, patch=4, is_material=True, sees_cues=sees_cues, num_attention=2)
+    network = TextureNetwork(config)
+    image, cues = random_condition_inputs(2, 32)
+    assert torch.equal(network(image, cues), network(image, 0 * cues)) != sees_cues
+
+
+def test_attention_starts_as_identity_and_then_reaches_every_place() -> None:
+    torch.manual_seed(0)
+    layer = SelfAttention(64)
+    features = torch.randn(1, 64, 4, 5)
+    assert torch.equal(layer(features), features)
+    nn.init.normal_(layer.out.weight)
+    changed = features.clone()
+    changed[0, 3, 0, 0] += 5
+    assert (layer(changed) - layer(features)).abs().sum(1).min() > 0
+    plain = nn.MultiheadAttention(64, 2, batch_first=True)
+    with torch.no_grad():
+        plain.in_proj_weight.copy_(layer.project.weight[:, :, 0, 0])
+        plain.in_proj_bias.copy_(layer.project.bias)
+        plain.out_proj.weight.copy_(layer.out.weight[:, :, 0, 0])
+        plain.out_proj.bias.copy_(layer.out.bias)
+    places = layer.norm(features).flatten(2).transpose(1, 2)
+    expected = features + plain(places, places, places)[0].transpose(1, 2).unflatten(-1, (4, 5))
+    torch.testing.assert_close(layer(features), expected, atol=1e-5, rtol=1e-4)
 
 
 def test_tokens_are_padded_with_zeros_from_64_to_77() -> None:

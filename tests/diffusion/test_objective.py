@@ -7,12 +7,14 @@ import torch
 
 from illuminerf.diffusion.augmentation import AugmentationConfig, make_batch
 from illuminerf.diffusion.cue_coding import encode_cues
+from illuminerf.diffusion.materials import true_texture
 from illuminerf.diffusion.objective import (
     Batch,
     Draws,
     LossWeights,
     anchor_loss,
-    rescaled_products,
+    best_gain,
+    materials_loss,
     step_totals,
     stratified_timesteps,
     training_loss,
@@ -29,7 +31,7 @@ def lambertian_batch(brightness: float = 0.4) -> tuple[torch.Tensor, Batch]:
     alpha = (torch.rand(2, 1, 16, 16) > 0.3).float()
     target = srgb_from_linear(lobes.sum(1)).clamp_max(1) * alpha
     products = encode_cues(lobes.flatten(1, 2))
-    return products, Batch(torch.cat([target, alpha], 1), products, target, alpha)
+    return products, Batch(torch.cat([target, alpha], 1), products, target, alpha, torch.rand(2, 5, 16, 16))
 
 
 def test_anchor_loss_is_zero_for_the_truth_and_by_hand_otherwise() -> None:
@@ -47,13 +49,23 @@ def test_brighter_than_saturated_is_free_but_brighter_than_the_truth_is_not() ->
     assert float(anchor_loss(products, darker)) > 1e-3
 
 
-def test_rescaled_products_take_out_a_gain_per_channel_and_nothing_else() -> None:
+def test_the_best_gain_takes_out_a_gain_per_channel_and_nothing_else() -> None:
     products, batch = lambertian_batch(brightness=0.15)
     gain = torch.tensor([0.5, 1.0, 2.0]).repeat(4)[:, None, None]
     dimmed = encode_cues(gain * products**2.2)
-    assert float(anchor_loss(rescaled_products(dimmed, batch), batch)) < 1e-6 < float(anchor_loss(dimmed, batch))
+    rescaled = dimmed * best_gain(dimmed, batch)
+    assert float(anchor_loss(rescaled, batch)) < 1e-6 < float(anchor_loss(dimmed, batch))
     shaded = products * torch.linspace(0.5, 1, 16)
-    assert float(anchor_loss(rescaled_products(shaded, batch), batch)) > 1e-4
+    assert float(anchor_loss(shaded * best_gain(shaded, batch), batch)) > 1e-4
+
+
+def test_materials_loss_is_zero_for_the_truth_and_by_hand_otherwise() -> None:
+    _, batch = lambertian_batch()
+    truth = true_texture(batch.surface)
+    assert float(materials_loss(truth, batch)) == 0
+    assert float(materials_loss(truth + 0.1, batch)) == pytest.approx(4 * 0.01, rel=1e-4)  # four lobes
+    outside = truth + (1 - batch.alpha)
+    assert float(materials_loss(outside, batch)) == 0
 
 
 def test_learning_rate_by_hand() -> None:
@@ -89,5 +101,5 @@ def test_a_few_steps_lower_the_loss(tmp_path: Path, with_diffusion: bool) -> Non
         optimizer.step()
         optimizer.zero_grad()
         losses.append(float(loss.detach()))
-    assert set(parts) == ({"anchor", "diffusion"} if with_diffusion else {"anchor"})
+    assert set(parts) == {"anchor", "rescaled", "materials"} | ({"diffusion"} if with_diffusion else set())
     assert sum(losses[-4:]) < 0.7 * sum(losses[:4])

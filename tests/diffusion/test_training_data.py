@@ -8,14 +8,15 @@ from safetensors.torch import save
 
 from illuminerf.diffusion.augmentation import (
     AugmentationConfig,
-    interpolated_specular,
+    Example,
     make_batch,
     plain_example,
     stack_examples,
 )
 from illuminerf.diffusion.cue_coding import decode_cues
+from illuminerf.diffusion.materials import composited
 from illuminerf.diffusion.objective import Batch
-from illuminerf.diffusion.relighting_scores import held_out_pairs, masked_psnr, masked_ssim, rescaled, true_composite
+from illuminerf.diffusion.relighting_scores import held_out_pairs, masked_psnr, masked_ssim, rescaled
 from illuminerf.diffusion.training_items import diffuse_level, load_items
 from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
 from illuminerf.scene.relighting_pairs import iterate_items
@@ -86,25 +87,17 @@ def test_items_are_straight_and_averaged_exactly(folder: Path) -> None:
 
 
 def test_plain_examples_are_exposed_alike(folder: Path) -> None:
-    image, cues, target, alpha = plain_example(load_items(folder, 32)[0], 0, 2)
+    image, cues, target, alpha, surface = plain_example(load_items(folder, 32)[0], 0, 2)
     assert float(diffuse_level(cues, alpha)) == pytest.approx(0.55, rel=1e-2)
-    batch = stack_examples([(image, cues, target, alpha)])
+    batch = stack_examples([Example(image, cues, target, alpha, surface)])
     assert batch.masked_image.shape == (1, 4, 32, 32)
     assert float(batch.masked_image.max()) <= 1
 
 
-def test_specular_interpolation_meets_the_cues_at_their_roughness() -> None:
-    lobes = torch.rand(4, 3, 5, 5)
-    for roughness, lobe in ((0.0, 1), (0.05, 1), (0.13, 2), (0.34, 3), (0.9, 0)):
-        torch.testing.assert_close(interpolated_specular(lobes, torch.tensor(roughness)), lobes[lobe])
-    between = interpolated_specular(lobes, torch.tensor((0.13 + 0.34) / 2))
-    torch.testing.assert_close(between, (lobes[2] + lobes[3]) / 2)
-
-
 def test_bound_by_true_materials_is_nearly_exact_on_the_discs(folder: Path) -> None:
     item = load_items(folder, 32)[0]
-    _, cues, target, alpha = plain_example(item, 0, 1)
-    truth, ours = (srgb_from_linear(x).clamp_max(1)[None] * alpha for x in (target, true_composite(item, cues)))
+    _, cues, target, alpha, surface = plain_example(item, 0, 1)
+    truth, ours = (srgb_from_linear(x).clamp_max(1)[None] * alpha for x in (target, composited(surface, cues)))
     assert float(masked_psnr(rescaled(ours, truth), truth, alpha[None])) > 35
     assert float(masked_psnr(rescaled(truth.roll(5, 2), truth), truth, alpha[None])) < 30
 

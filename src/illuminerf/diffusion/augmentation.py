@@ -7,18 +7,32 @@ composited from the cues (not exact, so only a share of the examples, never for 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from illuminerf.diffusion.cue_coding import CueCoding, code_cues
+from illuminerf.diffusion.materials import composited
 from illuminerf.diffusion.objective import Batch
 from illuminerf.diffusion.training_items import TrainingItem, diffuse_level
 from illuminerf.scene.images import srgb_from_linear
 
-_CUE_ROUGHNESS = (0.05, 0.13, 0.34)
-_DIFFUSE_LIKE_ROUGHNESS = 0.8
+
+class Example(NamedTuple):
+    """One relighting; linear and straight."""
+
+    image: Float[Tensor, "3 height width"]
+    """Under the input light."""
+    cues: Float[Tensor, "12 height width"]
+    """Under the target light."""
+    target: Float[Tensor, "3 height width"]
+    """Under the target light."""
+    alpha: Float[Tensor, "1 height width"]
+    """Coverage."""
+    surface: Float[Tensor, "5 height width"]
+    """Base colour, metallicity, roughness."""
 
 
 @dataclass(frozen=True)
@@ -58,52 +72,52 @@ def make_batch(
     return stack_examples(examples, coding)
 
 
-def stack_examples(examples: list[tuple[Tensor, Tensor, Tensor, Tensor]], coding: CueCoding = "power") -> Batch:
-    """(linear input, linear cues, linear target, alpha) per example to a coded batch in channels-last layout."""
-    image, cues, target, alpha = (torch.stack(parts) for parts in zip(*examples, strict=True))
+def stack_examples(examples: list[Example], coding: CueCoding = "power") -> Batch:
+    """Examples to a coded batch in channels-last layout."""
+    image, cues, target, alpha, surface = (torch.stack(parts) for parts in zip(*examples, strict=True))
     masked = torch.cat([srgb_from_linear(image).clamp_max(1) * alpha, alpha], 1)
     coded = code_cues(cues, alpha, coding)
-    tensors = (masked, coded, srgb_from_linear(target).clamp_max(1) * alpha, alpha)
+    tensors = (masked, coded, srgb_from_linear(target).clamp_max(1) * alpha, alpha, surface)
     return Batch(*(tensor.contiguous(memory_format=torch.channels_last) for tensor in tensors))
 
 
-def plain_example(item: TrainingItem, input_light: int, target_light: int, level: float = 0.55) -> tuple:
+def plain_example(item: TrainingItem, input_light: int, target_light: int, level: float = 0.55) -> Example:
     """No augmentation: one light to another, both exposed to the same diffuse level. For evaluation."""
     alpha = item.alpha.float()
     cues = item.cues.float()
     gains = [level / diffuse_level(cues[light], alpha) for light in (input_light, target_light)]
     target = item.targets[target_light].float() * gains[1]
-    return item.targets[input_light].float() * gains[0], cues[target_light] * gains[1], target, alpha
+    image = item.targets[input_light].float() * gains[0]
+    return Example(image, cues[target_light] * gains[1], target, alpha, surface_of(item))
 
 
 def _example(
     item: TrainingItem, albedo_item: TrainingItem, config: AugmentationConfig, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> Example:
     alpha = item.alpha.float()
     order = torch.randperm(len(item.targets), generator=generator).tolist()
     channels = torch.randperm(3, generator=generator)
     mixtures = [_mixture(order, config, generator), _mixture(order[::-1], config, generator)]
     is_composited = _uniform(generator) < config.composited_share
-    material = _random_material(item, albedo_item, generator) if is_composited else None
+    surface = _random_surface(item, albedo_item, generator) if is_composited else surface_of(item)
     images, cue_stacks = [], []
     for weights in mixtures:
         cues = _mixed(item.cues, weights.repeat(1, 4))
-        target = _mixed(item.targets, weights) if material is None else _composited(cues, *material)
+        target = composited(surface, cues) if is_composited else _mixed(item.targets, weights)
         gain = config.level / diffuse_level(cues, alpha)
         gain = gain * torch.exp(config.exposure * torch.randn((), generator=generator))
         images.append((target * gain)[channels])
         cue_stacks.append((cues * gain).unflatten(0, (4, 3))[:, channels].flatten(0, 1))
-    example = (images[0], cue_stacks[1], images[1], alpha)
-    if _uniform(generator) < 0.5:
-        return tuple(tensor.flip(-1) for tensor in example)  # type: ignore[return-value]
-    return example
+    surface = torch.cat([surface[:3][channels], surface[3:]])
+    example = Example(images[0], cue_stacks[1], images[1], alpha, surface)
+    return Example(*(tensor.flip(-1) for tensor in example)) if _uniform(generator) < 0.5 else example
 
 
 def composited_target(
     item: TrainingItem, albedo_item: TrainingItem, cues: Float[Tensor, "12 height width"], generator: torch.Generator
 ) -> Float[Tensor, "3 height width"]:
     """What an item would look like in a random material, from its cues alone; linear, straight."""
-    return _composited(cues, *_random_material(item, albedo_item, generator))
+    return composited(_random_surface(item, albedo_item, generator), cues)
 
 
 def _mixture(order: list[int], config: AugmentationConfig, generator: torch.Generator) -> Tensor:
@@ -124,10 +138,10 @@ def _mixed(lights: Float[Tensor, "lights channels height width"], weights: Tenso
     )
 
 
-def _random_material(
+def _random_surface(
     item: TrainingItem, albedo_item: TrainingItem, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(linear albedo [3, h, w], metallic, roughness): own, borrowed or plain texture, with a random tone curve."""
+) -> Float[Tensor, "5 height width"]:
+    """Own, borrowed or plain base colour with a random tone curve, one metallicity and one roughness."""
     kind = _uniform(generator)
     tint = torch.rand(3, 1, 1, generator=generator)
     if kind < 0.2:
@@ -138,28 +152,14 @@ def _random_material(
         covered = (item if kind < 0.5 else albedo_item).alpha.float()
         source = source * covered + 0.2 * (1 - covered)
         albedo = source.clamp(1e-3, 1) ** (0.5 + _uniform(generator)) * (0.4 + 0.6 * tint)
-    is_metal = _uniform(generator) < 0.25
-    metallic = torch.tensor(1.0 if is_metal else 0.0)
-    return albedo.clamp(0.01, 0.95), metallic, torch.tensor(0.03 + 0.77 * _uniform(generator))
+    plane = torch.ones_like(item.roughness, dtype=torch.float32)
+    metallic = float(_uniform(generator) < 0.25) * plane
+    return torch.cat([albedo.clamp(0.01, 0.95), metallic, (0.03 + 0.77 * _uniform(generator)) * plane])
 
 
-def _composited(cues: Tensor, albedo: Tensor, metallic: Tensor, roughness: Tensor) -> Tensor:
-    """Albedo * diffuse cue + Fresnel * specular cue, interpolated in roughness: linear [3, h, w]."""
-    lobes = cues.unflatten(0, (4, 3))
-    specular = interpolated_specular(lobes, roughness)
-    dielectric = albedo * lobes[0] + 0.05 * specular
-    return metallic * albedo * specular + (1 - metallic) * dielectric
-
-
-def interpolated_specular(lobes: Float[Tensor, "4 3 height width"], roughness: Tensor) -> Tensor:
-    """The white conductor's radiance at any roughness [] or [h, w]; beyond the roughest cue it fades to diffuse."""
-    knots = (*_CUE_ROUGHNESS, _DIFFUSE_LIKE_ROUGHNESS)
-    levels = (lobes[1], lobes[2], lobes[3], lobes[0])
-    result = levels[0]
-    for low, high, level in zip(knots[:-1], knots[1:], levels[1:], strict=True):
-        share = ((roughness - low) / (high - low)).clamp(0, 1)
-        result = result + share * (level - result)
-    return result
+def surface_of(item: TrainingItem) -> Float[Tensor, "5 height width"]:
+    """An item's own linear base colour, metallicity and roughness."""
+    return torch.cat([plane.float() for plane in (item.albedo, item.metallic, item.roughness)])
 
 
 def _integer(limit: int, generator: torch.Generator) -> int:

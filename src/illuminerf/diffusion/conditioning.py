@@ -50,8 +50,15 @@ class TextureConfig:
     is_material: bool = False
     """Deviation: decode with additive skips and one block per level, and read the texture as non-negative
     offset + gain * image, so that it can be the albedo of each lobe in full detail (embedded model)."""
+    sees_cues: bool = False
+    """Deviation: the network sees the cues beside the image (DiLightNet's: the image alone). They show the shape,
+    without which paint and shading are hard to tell apart."""
+    num_attention: int = 0
+    """Deviation: self-attention layers among the blocks at the lowest resolution (DiLightNet: none)."""
 
     def __post_init__(self) -> None:
+        if not 0 <= self.num_attention <= self.num_blocks:
+            raise ValueError("there is at most one attention layer per block")
         if min(self.widths) < 8 or any(width % 8 for width in self.widths):
             raise ValueError("widths are multiples of 8, for the group norms")
 
@@ -82,6 +89,8 @@ class Condition(NamedTuple):
     tokens: Float[Tensor, "batch text_length width"]
     embedding: Float[Tensor, "batch channels latent_height latent_width"]
     products: Float[Tensor, "batch 12 height width"]
+    maps: Float[Tensor, "batch maps height width"]
+    """What ConvNet 2 itself gives: see `TextureNetwork.maps`."""
 
     def repeated(self, num_samples: int) -> "Condition":
         """Each image's entry `num_samples` times in a row."""
@@ -143,20 +152,39 @@ class ResidualBlock(nn.Module):
         return features + self.layers(features)
 
 
+class SelfAttention(nn.Module):
+    """x + attention(GroupNorm8 x) over all places of [batch, width, height, width], in heads of 32 channels."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.num_heads = max(1, width // 32)
+        self.norm = nn.GroupNorm(8, width)
+        self.project = nn.Conv2d(width, 3 * width, 1)
+        self.out = _zero_initialised(nn.Conv2d(width, width, 1))
+
+    def forward(self, features: Tensor) -> Tensor:
+        rows, columns = features.shape[-2:]
+        heads = self.project(self.norm(features)).flatten(2).unflatten(1, (3, self.num_heads, -1))
+        query, key, value = heads.transpose(-1, -2).unbind(1)
+        mixed = functional.scaled_dot_product_attention(query, key, value).transpose(-1, -2)
+        return features + self.out(mixed.flatten(1, 2).unflatten(-1, (rows, columns)).contiguous())
+
+
 class TextureNetwork(nn.Module):
-    """ConvNet 2: masked image [batch, 4, height, width] -> texture [batch, 12, height, width]."""
+    """ConvNet 2: masked image [batch, 4, height, width] (and cues) -> texture [batch, 12, height, width]."""
 
     def __init__(self, config: TextureConfig) -> None:
         super().__init__()
         self.config = config
         widths, patch = config.widths, config.patch
-        first = NUM_IMAGE_CHANNELS * patch**2
+        first = (NUM_IMAGE_CHANNELS + NUM_CUE_CHANNELS * config.sees_cues) * patch**2
         self.stem = nn.Conv2d(first, widths[0], 3, 1, 1) if patch == 1 else nn.Conv2d(first, widths[0], 1)
         self.downs = nn.ModuleList(
             nn.Sequential(nn.Conv2d(fine, coarse, 3, 2, 1), nn.GroupNorm(8, coarse), nn.SiLU())
             for fine, coarse in zip(widths[:-1], widths[1:], strict=True)
         )
         self.blocks = nn.Sequential(*(ResidualBlock(widths[-1]) for _ in range(config.num_blocks)))
+        self.attentions = nn.ModuleList(SelfAttention(widths[-1]) for _ in range(config.num_attention))
         self.ups = nn.ModuleList(
             nn.Sequential(nn.ConvTranspose2d(coarse, fine, 4, 2, 1), nn.GroupNorm(8, fine), nn.SiLU())
             for coarse, fine in zip(widths[:0:-1], widths[-2::-1], strict=True)
@@ -177,15 +205,23 @@ class TextureNetwork(nn.Module):
             assert self.out.bias is not None
             self.out.bias.copy_(start.reshape(-1).repeat_interleave(self.config.patch**2))
 
-    def maps(self, masked_image: Float[Tensor, "batch 4 height width"]) -> Float[Tensor, "batch maps height width"]:
+    def maps(
+        self,
+        masked_image: Float[Tensor, "batch 4 height width"],
+        coded_cues: Float[Tensor, "batch 12 height width"],
+    ) -> Float[Tensor, "batch maps height width"]:
         """What the network itself gives: the texture, or a material's offsets and gains (24 maps)."""
         patch = self.config.patch
-        features = functional.silu(self.stem(functional.pixel_unshuffle(masked_image, patch)))
+        seen = torch.cat([masked_image, coded_cues], 1) if self.config.sees_cues else masked_image
+        features = functional.silu(self.stem(functional.pixel_unshuffle(seen, patch)))
         skips = []
         for down in self.downs:
             skips.append(features)
             features = down(features)
-        features = self.blocks(features)
+        for index, block in enumerate(self.blocks):
+            features = block(features)
+            if index < len(self.attentions):
+                features = self.attentions[index](features)
         for level, up in enumerate(self.ups):
             features = up(features)
             if self.config.is_material:
@@ -201,8 +237,12 @@ class TextureNetwork(nn.Module):
         offset, gain = maps.chunk(2, 1)
         return functional.softplus(offset + gain * rgb.repeat(1, NUM_CUE_CHANNELS // 3, 1, 1), beta=8.0)
 
-    def forward(self, masked_image: Float[Tensor, "batch 4 height width"]) -> Float[Tensor, "batch 12 height width"]:
-        return self.texture(self.maps(masked_image), masked_image[:, :3])
+    def forward(
+        self,
+        masked_image: Float[Tensor, "batch 4 height width"],
+        coded_cues: Float[Tensor, "batch 12 height width"],
+    ) -> Float[Tensor, "batch 12 height width"]:
+        return self.texture(self.maps(masked_image, coded_cues), masked_image[:, :3])
 
 
 class Conditioning(nn.Module):
@@ -214,14 +254,6 @@ class Conditioning(nn.Module):
         self.tokens = None if config.hears_text else ConvPyramid(NUM_IMAGE_CHANNELS, config.tokens)
         self.texture = TextureNetwork(config.texture)
         self.embedding = ConvPyramid(NUM_CUE_CHANNELS, config.embedding)
-
-    def products(
-        self,
-        masked_image: Float[Tensor, "batch 4 height width"],
-        coded_cues: Float[Tensor, "batch 12 height width"],
-    ) -> Float[Tensor, "batch 12 height width"]:
-        """Texture times cues, elementwise."""
-        return self.texture(masked_image) * coded_cues
 
     def forward(
         self,
@@ -236,14 +268,15 @@ class Conditioning(nn.Module):
             coded_cues: as the model's cue coding gives them.
             text: what the control hears where there is no ConvNet 1.
         """
-        products = self.products(masked_image, coded_cues)
+        maps = self.texture.maps(masked_image, coded_cues)
+        products = self.texture.texture(maps, masked_image[:, :3]) * coded_cues
         if self.tokens is not None:
             tokens = padded_tokens(self.tokens(masked_image), self.config.text_length)
         elif text is not None:
             tokens = text.expand(len(masked_image), -1, -1)
         else:
             raise ValueError("without ConvNet 1 a text embedding is needed")
-        return Condition(tokens, self.embedding(products), products)
+        return Condition(tokens, self.embedding(products), products, maps)
 
 
 def padded_tokens(

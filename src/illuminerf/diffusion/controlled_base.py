@@ -134,7 +134,7 @@ class ControlledBase(nn.Module):
     def at_full_size(
         self,
         decoded: Float[Tensor, "batch samples 3 height width"],
-        masked_image: Float[Tensor, "batch 4 height width"],
+        condition: Condition,
         pieces: list[Piece],
     ) -> list[Float[Tensor, "samples 3 side side"]]:
         """Enlarged or reduced as they are."""

@@ -109,7 +109,7 @@ def relight_photographs(
         for p, image, square in zip(photographs, images, squares, strict=True)
     ]
     results = []
-    for index, relit in enumerate(model.at_full_size(decoded, masked, pieces)):
+    for index, relit in enumerate(model.at_full_size(decoded, condition, pieces)):
         height, width = photographs[index].masked_image.shape[1:]
         # Over black no value exceeds the coverage.
         relit = torch.minimum(relit.clamp_min(0), pieces[index].masked_image[None, 3:])

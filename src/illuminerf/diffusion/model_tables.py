@@ -96,8 +96,8 @@ def layer_tables(model: RelightingModel | ControlledBase) -> dict[str, list[Laye
         rows += [Layer("flatten", (height * width, channels)), Layer("zero padding", (config.text_length, channels))]
         tables["ConvNet 1"] = rows
     image = torch.empty(1, NUM_IMAGE_CHANNELS, size, size, device="meta")
-    tables["ConvNet 2"] = _rows(model.conditioning.texture, image)
     cues = torch.empty(1, NUM_CUE_CHANNELS, size, size, device="meta")
+    tables["ConvNet 2"] = _rows(model.conditioning.texture, image, cues)
     tables["ConvNet 3"] = _rows(model.conditioning.embedding, cues)
     latent = torch.empty(1, *model.latent_shape(size, size), device="meta")
     tables["ConvNet 4"] = _rows(model.control.conv_in, latent)
@@ -105,7 +105,7 @@ def layer_tables(model: RelightingModel | ControlledBase) -> dict[str, list[Laye
 
 
 @torch.no_grad()
-def _rows(network: nn.Module, image: torch.Tensor) -> list[Layer]:
+def _rows(network: nn.Module, *images: torch.Tensor) -> list[Layer]:
     rows: list[Layer] = []
 
     def record(layer: nn.Module, _: Any, out: torch.Tensor) -> None:
@@ -116,7 +116,7 @@ def _rows(network: nn.Module, image: torch.Tensor) -> list[Layer]:
 
     layers = [layer for layer in network.modules() if isinstance(layer, nn.Conv2d | nn.ConvTranspose2d)]
     hooks = [layer.register_forward_hook(record) for layer in layers]
-    network(image)
+    network(*images)
     for hook in hooks:
         hook.remove()
     return rows

@@ -17,6 +17,7 @@ from torch.nn import functional
 from illuminerf.diffusion.conditioning import Condition
 from illuminerf.diffusion.controlled_base import ControlledBase
 from illuminerf.diffusion.cue_coding import GAMMA, composited_srgb, decode_cues
+from illuminerf.diffusion.materials import true_texture
 from illuminerf.diffusion.relighting_model import NUM_TRAIN_TIMESTEPS, RelightingModel, noise_schedule
 from illuminerf.scene.images import linear_from_srgb
 from illuminerf.workflow.device import torch_generator
@@ -30,6 +31,8 @@ class Batch(NamedTuple):
     coded_cues: Float[Tensor, "batch 12 height width"]
     target: Float[Tensor, "batch 3 height width"]
     alpha: Float[Tensor, "batch 1 height width"]
+    surface: Float[Tensor, "batch 5 height width"]
+    """What the object is made of: linear base colour, metallicity, roughness."""
 
 
 class Draws(NamedTuple):
@@ -78,18 +81,21 @@ def latent_weight(alpha: Float[Tensor, "batch 1 height width"], block: int, outs
 class LossWeights:
     """How the terms are added."""
 
-    anchor: float = 20.0
+    anchor: float = 5.0
     """Squared sRGB error of the composited products, per covered pixel."""
-    rescaled_anchor: float = 0.0
+    rescaled_anchor: float = 20.0
     """The same after the least-squares gain per image and channel: a single image cannot tell albedo from exposure,
     and without this term that part of the error outweighs shading and gloss."""
+    materials: float = 2.0
+    """Squared error of ConvNet 2's texture against what the object's true materials say, after the same gain, summed
+    over the lobes, per covered pixel and colour. Renders know their materials; the paper's loss does not use them."""
     diffusion: float = 1.0
     """Squared error of v, per covered latent coefficient."""
     outside: float = 0.05
     """Weight of latents without any covered pixel, beside 1 for the others."""
 
     def __post_init__(self) -> None:
-        if min(self.anchor, self.rescaled_anchor, self.diffusion, self.outside) < 0:
+        if min(self.anchor, self.rescaled_anchor, self.materials, self.diffusion, self.outside) < 0:
             raise ValueError("loss weights are not negative")
 
 
@@ -106,17 +112,25 @@ def stratified_timesteps(batch: int, generator: torch.Generator) -> Int[Tensor, 
     return (offsets[torch.randperm(batch, generator=generator)] * NUM_TRAIN_TIMESTEPS).long()
 
 
-def rescaled_products(
-    products: Float[Tensor, "batch 12 height width"], batch: Batch
-) -> Float[Tensor, "batch 12 height width"]:
-    """Products times the gain per image and channel that brings their composite nearest to the target (linear light,
-    gain without gradient, within a factor of 4)."""
+def best_gain(products: Float[Tensor, "batch 12 height width"], batch: Batch) -> Float[Tensor, "batch 12 1 1"]:
+    """The gain per image and channel on coded values that brings the products' composite nearest to the target (least
+    squares in linear light, within a factor of 4); without gradient."""
     ours = decode_cues(products.detach()).unflatten(1, (4, 3)).sum(1)
     truth = linear_from_srgb(batch.target / batch.alpha.clamp_min(1e-3))
     weight = batch.alpha * (batch.target < batch.alpha)
     gain = (ours * truth * weight).sum((2, 3)) / (ours.square() * weight).sum((2, 3)).clamp_min(1e-6)
     coded = gain.clamp(0.25, 4.0) ** (1 / GAMMA)
-    return products * coded[:, :, None, None].repeat(1, 4, 1, 1)
+    return coded[:, :, None, None].repeat(1, 4, 1, 1)
+
+
+def materials_loss(
+    texture: Float[Tensor, "batch 12 height width"], batch: Batch, covered: Float[Tensor, ""] | None = None
+) -> Float[Tensor, ""]:
+    """Squared error of the texture against the true materials', in coded values: summed over the four lobes, mean over
+    covered pixels and colours (`covered` as in `anchor_loss`)."""
+    errors = (texture - true_texture(batch.surface)).square() * batch.alpha
+    covered = batch.alpha.sum() if covered is None else covered
+    return errors.sum() / (3 * covered).clamp_min(1.0)
 
 
 def anchor_loss(
@@ -151,9 +165,13 @@ def training_loss(
         anchor = anchor_loss(condition.products, batch, totals.covered)
         parts["anchor"] = anchor.detach()
         loss = loss + weights.anchor * anchor if anchor.requires_grad else loss
-        if weights.rescaled_anchor > 0 and anchor.requires_grad:
-            rescaled = anchor_loss(rescaled_products(condition.products, batch), batch, totals.covered)
+        if anchor.requires_grad and (weights.rescaled_anchor > 0 or weights.materials > 0):
+            gain = best_gain(condition.products, batch)
+            rescaled = anchor_loss(condition.products * gain, batch, totals.covered)
             loss, parts["rescaled"] = loss + weights.rescaled_anchor * rescaled, rescaled.detach()
+            texture = model.conditioning.texture.texture(condition.maps, batch.masked_image[:, :3])
+            materials = materials_loss(texture * gain, batch, totals.covered)
+            loss, parts["materials"] = loss + weights.materials * materials, materials.detach()
     if weights.diffusion > 0:
         diffusion = _diffusion_loss(model, batch, condition, draws, totals, weights.outside, scale_momentum)
         loss, parts["diffusion"] = loss + weights.diffusion * diffusion, diffusion.detach()

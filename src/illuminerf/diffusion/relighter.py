@@ -72,7 +72,7 @@ class Relighter(Protocol):
     def at_full_size(
         self,
         decoded: Float[Tensor, "batch samples 3 height width"],
-        masked_image: Float[Tensor, "batch 4 height width"],
+        condition: Condition,
         pieces: list[Piece],
     ) -> list[Float[Tensor, "samples 3 side side"]]:
         """Decoded latents as sRGB over black (unclipped) at the size of each photograph's piece."""

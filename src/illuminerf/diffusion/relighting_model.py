@@ -63,14 +63,16 @@ class RelightingModelConfig:
 
     image_size: int = 128
     """Pixels per side that it was trained at."""
-    latents: PatchLatentConfig = field(default=PatchLatentConfig())
+    latents: PatchLatentConfig = field(default=PatchLatentConfig(block=8, keep=2))
     """The stand-in for a VAE."""
     unet: UNetConfig = field(default=UNetConfig())
     """The base."""
     conditioning: ConditioningConfig = field(
         default=ConditioningConfig(
             tokens=PyramidConfig(widths=(32, 48, 64), out_channels=128, patch=4),
-            texture=TextureConfig(widths=(48, 96, 160), num_blocks=4, patch=4, is_material=True),
+            texture=TextureConfig(
+                widths=(96, 192, 320), num_blocks=4, patch=4, is_material=True, sees_cues=True, num_attention=2
+            ),
             embedding=PyramidConfig(widths=(32, 64), out_channels=64, patch=4),
         )
     )
@@ -162,18 +164,19 @@ class RelightingModel(nn.Module):
     def at_full_size(
         self,
         decoded: Float[Tensor, "batch samples 3 height width"],
-        masked_image: Float[Tensor, "batch 4 height width"],
+        condition: Condition,
         pieces: list[Piece],
     ) -> list[Float[Tensor, "samples 3 side side"]]:
         """Detail comes back the way it went in: the material maps (offsets and gains on the image) and the sampled
         residual are smooth and are enlarged; photograph and cues, which carry the detail, are used at full size."""
-        maps = self.conditioning.texture.maps(masked_image)
         results = []
         for index, piece in enumerate(pieces):
             image, side = piece.masked_image[None], piece.masked_image.shape[-1]
             relit = resized(decoded[index], side)
             if self.config.latent_is_residual:
-                texture = self.conditioning.texture.texture(resized(maps[index : index + 1], side), image[:, :3])
+                texture = self.conditioning.texture.texture(
+                    resized(condition.maps[index : index + 1], side), image[:, :3]
+                )
                 products = texture * encode_cues(piece.linear_cues[None])
                 relit = relit + composited_srgb(products).clamp_max(1) * image[:, 3:]
             else:

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from illuminerf.diffusion.augmentation import interpolated_specular, plain_example, stack_examples
+from illuminerf.diffusion.augmentation import plain_example, stack_examples
 from illuminerf.diffusion.cue_coding import decode_cues, encode_cues
+from illuminerf.diffusion.materials import composited
 from illuminerf.diffusion.relighter import Relighter
 from illuminerf.diffusion.sampling import Sampler, sample_relit
 from illuminerf.diffusion.training_items import TrainingItem
@@ -83,14 +84,6 @@ def held_out_pairs(items: list[TrainingItem], num_pairs: int) -> list[tuple[Trai
     return pairs
 
 
-def true_composite(item: TrainingItem, linear_cues: Float[Tensor, "12 height width"]) -> Tensor:
-    """Upper bound: compositing the cues with the item's true materials; linear [3, h, w]."""
-    lobes = linear_cues.unflatten(0, (4, 3))
-    specular = interpolated_specular(lobes, item.roughness.float())
-    albedo, metallic = item.albedo.float(), item.metallic.float()
-    return metallic * albedo * specular + (1 - metallic) * (albedo * lobes[0] + 0.04 * specular)
-
-
 @torch.inference_mode()
 def evaluate(
     model: Relighter,
@@ -112,7 +105,8 @@ def evaluate(
     pairs = held_out_pairs(items, num_pairs)
     examples = [plain_example(*pair) for pair in pairs]
     batch = stack_examples(examples, model.cue_coding)
-    diffuse_cues = encode_cues(torch.stack([example[1] for example in examples]))[:, :3]
+    linear_cues = torch.stack([example.cues for example in examples])
+    diffuse_cues = encode_cues(linear_cues)[:, :3]
     samples, anchors = [], []
     for start in range(0, len(pairs), batch_size):
         rows = slice(start, start + batch_size)
@@ -122,12 +116,12 @@ def evaluate(
         if model.latent_is_residual:
             anchors.append(model.anchor(model.condition(image, cues), image[:, 3:]).float().cpu())
     drawn = torch.cat(samples)
-    bounds = [true_composite(pair[0], example[1]) for pair, example in zip(pairs, examples, strict=True)]
+    bound = composited(batch.surface, linear_cues)
     images = {
         "input": batch.masked_image[:, :3],
         "mean_albedo": _mean_albedo_estimate(batch.masked_image, decode_cues(diffuse_cues)),
         "mean": drawn.mean(1),
-        "bound": srgb_from_linear(torch.stack(bounds)).clamp_max(1) * batch.alpha,
+        "bound": srgb_from_linear(bound).clamp_max(1) * batch.alpha,
     }
     if anchors:
         images["anchor"] = torch.cat(anchors)
