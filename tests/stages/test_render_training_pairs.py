@@ -1,5 +1,12 @@
 """Training pairs: the items' form, their determinism, resuming, damage, and broken objects by name."""
 
+import contextlib
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -184,6 +191,47 @@ def test_a_damaged_staged_item_is_made_again(
     monkeypatch.setattr(render_training_pairs, "pack_shard", spoil_then_pack)
     render_training_pairs.run(*assets, CONFIG, out)
     assert shards(out) == shards(tmp_path / "whole")
+
+
+def test_a_full_disk_is_explained_and_loses_nothing(
+    assets: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    render_training_pairs.run(*assets, CONFIG, tmp_path / "whole")
+    out, real = tmp_path / "full", Path.write_bytes
+
+    def write(path: Path, content: bytes) -> int:
+        if len(list(out.glob("staging/*/[!.]*.item"))) >= 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(path, content)
+
+    monkeypatch.setattr(Path, "write_bytes", write)
+    with pytest.raises(UserError, match="the disk is full"):
+        render_training_pairs.run(*assets, CONFIG, out)
+    monkeypatch.setattr(Path, "write_bytes", real)
+    assert len(list(out.glob("staging/*/*.item"))) == 2 and not list(out.rglob("*.partial*"))
+    render_training_pairs.run(*assets, CONFIG, out)
+    assert shards(out) == shards(tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_killed_again_and_again_the_bytes_are_the_same(assets: tuple[Path, Path], tmp_path: Path) -> None:
+    """SIGKILL of the whole process group, at growing numbers of finished items."""
+    render_training_pairs.run(*assets, CONFIG, tmp_path / "whole")
+    out = tmp_path / "killed"
+    code = (
+        "from tests.stages.test_render_training_pairs import *; import sys; from pathlib import Path; "
+        "render_training_pairs.run(Path(sys.argv[1]), Path(sys.argv[2]), CONFIG, sys.argv[3], Execution(workers=2))"
+    )
+    command = [sys.executable, "-c", code, *map(str, assets), str(out)]
+    for num_items in (1, 3, 5):
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
+        while process.poll() is None and len(list(out.glob("staging/*/*.item"))) < num_items:
+            time.sleep(0.02)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    render_training_pairs.run(*assets, CONFIG, out)
+    assert shards(out) == shards(tmp_path / "whole") and not list(out.rglob("*.partial*"))
 
 
 def test_unusable_lights_are_left_out_by_name(assets: tuple[Path, Path], tmp_path: Path) -> None:
