@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from illuminerf.data.capture import write_capture
+from illuminerf.data.capture import load_capture, write_capture
+from illuminerf.diffusion.augmentation import TRAINING_LEVEL
 from illuminerf.diffusion.hub import repository_folder
 from illuminerf.diffusion.pretrained import save_relighter
 from illuminerf.diffusion.relighting_model import save_model
 from illuminerf.presets import PRESETS
 from illuminerf.scene.cameras import Cameras, look_at
-from illuminerf.scene.images import read_png, write_exr
+from illuminerf.scene.images import read_exr, read_png, write_exr
 from illuminerf.stages import relight_views
 from illuminerf.stages.relight_views import Config, sample_path
 from illuminerf.workflow.atomic import write_json
@@ -62,6 +63,19 @@ def test_samples_are_complete_seeded_and_masked(inputs: tuple[Path, Path, Path],
     assert len({seed for row in seeds.values() for seed in row}) == 6
     again = relight_views.run(*inputs, CONFIG, tmp_path / "again")
     assert samples(again) == samples(out)
+
+
+def test_one_exposure_for_all_views_from_the_diffuse_cue(inputs: tuple[Path, Path, Path]) -> None:
+    capture, cues, _ = inputs
+    views = load_capture(capture).views
+    assert relight_views.exposure_for(views, cues) == pytest.approx(TRAINING_LEVEL / 0.5, rel=1e-3)
+    for path in (cues / "cues").iterdir():
+        channels = read_exr(path)
+        write_exr(path, {name: 0.1 * image if name != "A" else image for name, image in channels.items()})
+    assert relight_views.exposure_for(views, cues) == pytest.approx(TRAINING_LEVEL / 0.05, rel=1e-3)
+    for path in (cues / "cues").iterdir():
+        write_exr(path, {name: 0 * image if name != "A" else image for name, image in read_exr(path).items()})
+    assert relight_views.exposure_for(views, cues) == 1
 
 
 def test_existing_samples_are_kept_and_missing_ones_made(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:

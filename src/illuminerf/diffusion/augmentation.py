@@ -19,6 +19,9 @@ from illuminerf.diffusion.objective import Batch
 from illuminerf.diffusion.training_items import TrainingItem, diffuse_level
 from illuminerf.scene.images import srgb_from_linear
 
+TRAINING_LEVEL = 0.55
+"""Mean diffuse cue over an object, that is the mean radiance of a white one, which examples are exposed to."""
+
 
 class Example(NamedTuple):
     """One relighting; linear and straight."""
@@ -47,7 +50,7 @@ class AugmentationConfig:
     """Standard deviation of the log gain per colour channel of each light in a mixture."""
     exposure: float = 0.4
     """Standard deviation of the log exposure of input and target, independently."""
-    level: float = 0.55
+    level: float = TRAINING_LEVEL
     """Median over examples of the mean diffuse cue (a white object's mean radiance)."""
 
     def __post_init__(self) -> None:
@@ -81,7 +84,7 @@ def stack_examples(examples: list[Example], coding: CueCoding = "power") -> Batc
     return Batch(*(tensor.contiguous(memory_format=torch.channels_last) for tensor in tensors))
 
 
-def plain_example(item: TrainingItem, input_light: int, target_light: int, level: float = 0.55) -> Example:
+def plain_example(item: TrainingItem, input_light: int, target_light: int, level: float = TRAINING_LEVEL) -> Example:
     """No augmentation: one light to another, both exposed to the same diffuse level. For evaluation."""
     alpha = item.alpha.float()
     cues = item.cues.float()

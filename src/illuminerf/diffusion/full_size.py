@@ -17,6 +17,7 @@ from illuminerf.diffusion.cue_coding import code_cues
 from illuminerf.diffusion.relighter import Piece, Relighter
 from illuminerf.diffusion.resizing import resized
 from illuminerf.diffusion.sampling import Sampler, sample_decoded
+from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
 
 _MARGIN = 1.04
 _LEAST_COVERAGE = 0.05
@@ -87,8 +88,20 @@ def relight_photographs(
     sampler: Sampler = "ddim",
     temperature: float = 1.0,
     samples_at_once: int = 0,
+    exposure: float = 1.0,
 ) -> list[Float[Tensor, "samples 3 height width"]]:
-    """Draw relit images of each photograph at its own size: sRGB over black in [0, 1] (arguments as `sample_relit`)."""
+    """Draw relit images of each photograph at its own size: sRGB over black in [0, 1].
+
+    Args:
+        model: of either kind.
+        photographs: with the cues of the target light.
+        seeds: per photograph, one per sample.
+        num_steps, sampler, temperature: as for `sample_relit`.
+        samples_at_once: of each photograph, to save memory; 0: all.
+        exposure: the model sees the cues times this factor, and what it says is divided by it in linear light: models
+            are at their best where the target light is about as bright as those that they were trained under.
+    """
+    photographs = [Photograph(p.masked_image, p.linear_cues * exposure) for p in photographs]
     size = model.image_size
     squares = [object_square(photograph.masked_image[3]) for photograph in photographs]
     images = [cut_out(p.masked_image, square) for p, square in zip(photographs, squares, strict=True)]
@@ -111,7 +124,11 @@ def relight_photographs(
     results = []
     for index, relit in enumerate(model.at_full_size(decoded, condition, pieces)):
         height, width = photographs[index].masked_image.shape[1:]
+        coverage = pieces[index].masked_image[None, 3:]
+        if exposure != 1:
+            straight = linear_from_srgb(relit / coverage.clamp_min(_LEAST_COVERAGE)) / exposure
+            relit = srgb_from_linear(straight) * coverage
         # Over black no value exceeds the coverage.
-        relit = torch.minimum(relit.clamp_min(0), pieces[index].masked_image[None, 3:])
+        relit = torch.minimum(relit.clamp_min(0), coverage)
         results.append(torch.stack([put_back(image, squares[index], height, width) for image in relit]))
     return results

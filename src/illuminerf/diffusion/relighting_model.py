@@ -178,7 +178,10 @@ class RelightingModel(nn.Module):
                     resized(condition.maps[index : index + 1], side), image[:, :3]
                 )
                 products = texture * encode_cues(piece.linear_cues[None])
-                relit = relit + composited_srgb(products).clamp_max(1) * image[:, 3:]
+                composite = composited_srgb(products)
+                relit = relit + composite.clamp_max(1) * image[:, 3:]
+                # What is saturated keeps how bright it is, for whoever exposes it differently.
+                relit = relit + (relit >= image[:, 3:]) * (composite - 1).clamp_min(0) * image[:, 3:]
             else:
                 relit = (relit + 1) / 2
             results.append(relit)

@@ -16,6 +16,7 @@ import torch
 
 from illuminerf.cues.renderer import CUE_CHANNELS
 from illuminerf.data.capture import load_capture
+from illuminerf.diffusion.augmentation import TRAINING_LEVEL
 from illuminerf.diffusion.full_size import Photograph, relight_photographs, straight_cues
 from illuminerf.diffusion.pretrained import model_folder, pretrained_model
 from illuminerf.diffusion.relighter import Relighter
@@ -30,6 +31,8 @@ from illuminerf.workflow.processes import shard_of
 from illuminerf.workflow.progress import say, step_progress
 
 STAGE = "relight_views"
+_METERED_VIEWS = 8
+_DARK = 1e-4
 
 
 @dataclass(frozen=True)
@@ -129,11 +132,12 @@ def _relight_all(
     if device == torch.device("cuda"):  # under a launcher each process has a GPU of its own
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
     network = pretrained_model(folder, device)
+    exposure = exposure_for(views, cues)
     num_views = sum(map(len, ours))
     with step_progress("relight views", num_views, num_views - sum(map(len, todo))) as progress:
         for batch in todo:
             with autocast(device, config.precision):
-                _relight(network, views, cues, batch, [seeds[view] for view in batch], config, out, device)
+                _relight(network, views, cues, batch, [seeds[view] for view in batch], config, out, exposure)
             progress.advance(len(batch))
 
 
@@ -145,9 +149,9 @@ def _relight(
     seeds: list[list[int]],
     config: Config,
     out: Path,
-    device: torch.device,
+    exposure: float,
 ) -> None:
-    photographs = [_photograph(views, view, cues, device) for view in batch]
+    photographs = [_photograph(views, view, cues, network.device) for view in batch]
     relit = relight_photographs(
         network,
         photographs,
@@ -156,10 +160,24 @@ def _relight(
         config.sampler,
         config.temperature,
         config.samples_at_once,
+        exposure,
     )
     for view, samples in zip(batch, relit, strict=True):
         for sample, image in enumerate(samples):
             write_png(sample_path(out, view, sample), image.permute(1, 2, 0).cpu().numpy())
+
+
+def exposure_for(views: Views, cues: Path) -> float:
+    """The factor that brings the diffuse cue to the level that models are trained at: one for all views, so that they
+    agree, from the mean over covered pixels of a few of them. 1 where the light hardly reaches the object."""
+    chosen = np.linspace(0, len(views) - 1, min(len(views), _METERED_VIEWS)).round().astype(int)
+    total, covered = 0.0, 0.0
+    for view in chosen:
+        channels = read_exr(Path(cues) / "cues" / f"{view:03d}.exr")
+        total += float(sum(channels[name].sum(dtype=np.float64) for name in CUE_CHANNELS[:3]))
+        covered += 3 * float(channels["A"].sum(dtype=np.float64))
+    level = total / max(covered, 1e-6)
+    return TRAINING_LEVEL / level if level > _DARK else 1.0
 
 
 def _photograph(views: Views, view: int, cues: Path, device: torch.device) -> Photograph:
