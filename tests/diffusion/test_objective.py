@@ -1,5 +1,6 @@
 """The loss: zero for the truth, v by hand, learnable."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from illuminerf.diffusion.objective import (
     anchor_loss,
     best_gain,
     materials_loss,
+    relative_loss,
     step_totals,
     stratified_timesteps,
     training_loss,
@@ -57,6 +59,13 @@ def test_the_best_gain_takes_out_a_gain_per_channel_and_nothing_else() -> None:
     assert float(anchor_loss(rescaled, batch)) < 1e-6 < float(anchor_loss(dimmed, batch))
     shaded = products * torch.linspace(0.5, 1, 16)
     assert float(anchor_loss(shaded * best_gain(shaded, batch), batch)) > 1e-4
+
+
+def test_relative_loss_is_the_logarithm_that_psnr_averages() -> None:
+    products, batch = lambertian_batch(brightness=0.15)
+    grey = batch._replace(target=(batch.target + 0.1) * batch.alpha)
+    assert float(relative_loss(products, grey)) == pytest.approx(2 * math.log(0.01 + 1e-4), rel=1e-3)
+    assert float(relative_loss(products, batch)) == pytest.approx(2 * math.log(1e-4), rel=1e-2)
 
 
 def test_materials_loss_is_zero_for_the_truth_and_by_hand_otherwise() -> None:

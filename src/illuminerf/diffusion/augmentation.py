@@ -1,7 +1,8 @@
 """From rendered items to training examples: augmentations that are exact for light transport.
 
 Targets and cues are linear in the light, so any non-negative, tinted mixture of an item's lights is again a correct
-pair of cues and target. Further: one RGB permutation for everything, mirror images, exposure, and random materials
+pair of cues and target. Further: one RGB permutation for everything, mirror images, quarter turns, exposure, and random
+materials
 composited from the cues (not exact, so only a share of the examples, never for evaluation).
 """
 
@@ -42,7 +43,7 @@ class Example(NamedTuple):
 class AugmentationConfig:
     """How examples are varied."""
 
-    composited_share: float = 0.3
+    composited_share: float = 0.4
     """Share of examples whose material is random and composited from the cues."""
     mixture_share: float = 0.5
     """Share of input and of target lights that are mixtures of two rendered lights rather than one."""
@@ -50,6 +51,8 @@ class AugmentationConfig:
     """Standard deviation of the log gain per colour channel of each light in a mixture."""
     exposure: float = 0.4
     """Standard deviation of the log exposure of input and target, independently."""
+    turns: bool = True
+    """Turn pictures by quarters: light and view turn together, so cues and target still agree."""
     level: float = TRAINING_LEVEL
     """Median over examples of the mean diffuse cue (a white object's mean radiance)."""
 
@@ -113,7 +116,11 @@ def _example(
         cue_stacks.append((cues * gain).unflatten(0, (4, 3))[:, channels].flatten(0, 1))
     surface = torch.cat([surface[:3][channels], surface[3:]])
     example = Example(images[0], cue_stacks[1], images[1], alpha, surface)
-    return Example(*(tensor.flip(-1) for tensor in example)) if _uniform(generator) < 0.5 else example
+    is_mirrored, quarter_turns = _uniform(generator) < 0.5, 0
+    if config.turns:
+        quarter_turns = _integer(4, generator)
+    turned = (torch.rot90(tensor, quarter_turns, (-2, -1)) for tensor in example)
+    return Example(*(tensor.flip(-1) if is_mirrored else tensor for tensor in turned))
 
 
 def composited_target(

@@ -23,6 +23,8 @@ from illuminerf.scene.images import linear_from_srgb
 from illuminerf.workflow.device import torch_generator
 from illuminerf.workflow.processes import sum_over_processes
 
+_NEGLIGIBLE_ERROR = 1e-4  # 40 dB
+
 
 class Batch(NamedTuple):
     """One optimisation step's examples; sRGB over black, coded straight cues."""
@@ -83,9 +85,9 @@ class LossWeights:
 
     anchor: float = 5.0
     """Squared sRGB error of the composited products, per covered pixel."""
-    rescaled_anchor: float = 20.0
-    """The same after the least-squares gain per image and channel: a single image cannot tell albedo from exposure,
-    and without this term that part of the error outweighs shading and gloss."""
+    rescaled_anchor: float = 0.3
+    """Logarithm of each image's mean squared error after the least-squares gain per image and channel, which is what
+    PSNR averages: a single image cannot tell albedo from exposure, and easy images count as much as hard ones."""
     materials: float = 2.0
     """Squared error of ConvNet 2's texture against what the object's true materials say, after the same gain, summed
     over the lobes, per covered pixel and colour. Renders know their materials; the paper's loss does not use them."""
@@ -141,11 +143,20 @@ def anchor_loss(
     `covered` is that number in the whole step, where `batch` is a part of it. Only where the target is saturated may
     the products be brighter than 1 for free.
     """
+    covered = batch.alpha.sum() if covered is None else covered
+    return _squared_errors(products, batch).sum() / (3 * covered).clamp_min(1.0)
+
+
+def _squared_errors(products: Float[Tensor, "batch 12 height width"], batch: Batch) -> Tensor:
     estimate = composited_srgb(products).clamp_max(2.0) * batch.alpha
     saturated = (batch.target >= batch.alpha) & (estimate > batch.target)
-    errors = torch.where(saturated, torch.zeros_like(estimate), estimate - batch.target).square()
-    covered = batch.alpha.sum() if covered is None else covered
-    return errors.sum() / (3 * covered).clamp_min(1.0)
+    return torch.where(saturated, torch.zeros_like(estimate), estimate - batch.target).square()
+
+
+def relative_loss(products: Float[Tensor, "batch 12 height width"], batch: Batch) -> Float[Tensor, ""]:
+    """Sum over images of the logarithm of the mean squared sRGB error of the composited products, per covered pixel."""
+    errors = _squared_errors(products, batch).sum((1, 2, 3)) / (3 * batch.alpha.sum((1, 2, 3))).clamp_min(1.0)
+    return (errors + _NEGLIGIBLE_ERROR).log().sum()
 
 
 def training_loss(
@@ -167,7 +178,7 @@ def training_loss(
         loss = loss + weights.anchor * anchor if anchor.requires_grad else loss
         if anchor.requires_grad and (weights.rescaled_anchor > 0 or weights.materials > 0):
             gain = best_gain(condition.products, batch)
-            rescaled = anchor_loss(condition.products * gain, batch, totals.covered)
+            rescaled = relative_loss(condition.products * gain, batch) / totals.examples
             loss, parts["rescaled"] = loss + weights.rescaled_anchor * rescaled, rescaled.detach()
             texture = model.conditioning.texture.texture(condition.maps, batch.masked_image[:, :3])
             materials = materials_loss(texture * gain, batch, totals.covered)
