@@ -37,7 +37,7 @@ NUM_TRAIN_TIMESTEPS = 1000
 class UNetConfig:
     """Widths of the base UNet; the controlled copy has those of its encoder and middle block."""
 
-    block_out_channels: tuple[int, ...] = (64, 128)
+    block_out_channels: tuple[int, ...] = (48, 96)
     """Channels per resolution, the first at the latent's."""
     attention_blocks: tuple[bool, ...] = (False, True)
     """Which resolutions of the encoder attend to the tokens."""
@@ -45,7 +45,7 @@ class UNetConfig:
     """Whether the base's decoder has attention too, at the mirrored resolutions."""
     layers_per_block: int = 1
     """Residual blocks per resolution."""
-    cross_attention_dim: int = 128
+    cross_attention_dim: int = 96
     """Width of a token."""
     num_heads: int = 4
     """Attention heads."""
@@ -69,11 +69,11 @@ class RelightingModelConfig:
     """The base."""
     conditioning: ConditioningConfig = field(
         default=ConditioningConfig(
-            tokens=PyramidConfig(widths=(32, 48, 64), out_channels=128, patch=4),
+            tokens=PyramidConfig(widths=(32, 48, 64), out_channels=96, patch=4),
             texture=TextureConfig(
                 widths=(96, 192, 320), num_blocks=4, patch=4, is_material=True, sees_cues=True, num_attention=2
             ),
-            embedding=PyramidConfig(widths=(32, 64), out_channels=64, patch=4),
+            embedding=PyramidConfig(widths=(32, 48), out_channels=48, patch=4),
         )
     )
     """ConvNets 1 to 3."""

@@ -67,7 +67,11 @@ class Config:
     """Sizes of the embedded kind's networks."""
     control: ControlledBaseConfig = field(default=ControlledBaseConfig())
     """Where its `base` is named, the paper's kind is trained instead: a control on that frozen base."""
-    phases: tuple[Phase, ...] = (Phase(1500, 64, "products"), Phase(2000, 64), Phase(1000, 128))
+    phases: tuple[Phase, ...] = (
+        Phase(3500, 64, "products"),
+        Phase(600, 128, "products"),
+        Phase(1600, 128),
+    )
     """In order. Deviation: the paper trains 150,000 steps at one resolution."""
     batch_size: int = 32
     """Examples per step, over all processes and parts (paper: 512)."""
