@@ -68,9 +68,9 @@ class Config:
     control: ControlledBaseConfig = field(default=ControlledBaseConfig())
     """Where its `base` is named, the paper's kind is trained instead: a control on that frozen base."""
     phases: tuple[Phase, ...] = (
-        Phase(3500, 64, "products"),
-        Phase(600, 128, "products"),
-        Phase(1600, 128),
+        Phase(2500, 64, "products"),
+        Phase(500, 128, "products"),
+        Phase(700, 128),
     )
     """In order. Deviation: the paper trains 150,000 steps at one resolution."""
     batch_size: int = 32
