@@ -1,6 +1,5 @@
 """The command line: one subcommand per stage, plus `relight` and `demo` that run them all."""
 
-import os
 import sys
 import warnings
 from collections.abc import Callable
@@ -35,7 +34,7 @@ PositionalPath = Annotated[Path, tyro.conf.Positional]
 _DEFAULT_PAIRS = render_training_pairs.Config()
 _PAPER_PAIRS = render_training_pairs.Config.paper()
 _DEFAULT_PREVIEW = preview_training_pairs.Config()
-_ALL_CORES = Execution(workers=os.cpu_count() or 1)
+_ALL_CORES = Execution()
 
 
 def relight_command(

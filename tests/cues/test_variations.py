@@ -55,7 +55,7 @@ def test_each_switch_works_alone() -> None:
             name for seed in range(12) for name in varied(parts, variation, np.random.default_rng(seed), another)[1]
         ]
         assert names and set(names) <= set(allowed)
-    assert varied(parts, MaterialVariation.none(), np.random.default_rng(0), another) == (parts, [])
+    assert varied(parts, MaterialVariation.none(), np.random.default_rng(0), another) == (parts, [], [])
 
 
 def test_switching_one_variation_off_leaves_the_others() -> None:
@@ -69,7 +69,7 @@ def test_switching_one_variation_off_leaves_the_others() -> None:
 def test_a_broken_neighbour_is_not_used() -> None:
     parts = [(BALL, Material())]
     every = MaterialVariation(0.0, 1.0, 1.0)
-    assert varied(parts, every, np.random.default_rng(0), lambda _: None) == (parts, [])
+    assert varied(parts, every, np.random.default_rng(0), lambda _: None) == (parts, [], [])
 
 
 def test_a_borrowed_texture_lies_flat_on_every_side() -> None:

@@ -2,6 +2,8 @@
 
 import contextlib
 import errno
+import itertools
+import json
 import os
 import signal
 import subprocess
@@ -29,7 +31,7 @@ from illuminerf.stages import render_training_pairs
 from illuminerf.stages.render_training_pairs import Config
 from illuminerf.workflow.atomic import read_json
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.task_pool import Execution
+from illuminerf.workflow.task_pool import Crash, Execution
 
 VIEWS = ViewSettings(
     num_views=2, num_lights=2, size=24, samples_per_pixel=4, cue_sampling=CueSampling(4), light_height=8
@@ -172,6 +174,103 @@ def test_finished_shards_stay_and_damaged_ones_are_made_again(assets: tuple[Path
         list(iterate_items(out))
     render_training_pairs.run(*assets, CONFIG, out)
     assert shards(out) == before and kept.stat().st_mtime_ns == times[kept]
+
+
+def test_a_lost_manifest_is_written_again(assets: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "pairs"
+    render_training_pairs.run(*assets, CONFIG, out)
+    whole, times = (out / "manifest.json").read_bytes(), [p.stat().st_mtime_ns for p in out.glob("*.tar")]
+    for spoil in (Path.unlink, lambda path: path.write_text("garbage")):
+        spoil(out / "manifest.json")
+        render_training_pairs.run(*assets, CONFIG, out)
+        assert (out / "manifest.json").read_bytes() == whole
+    assert [p.stat().st_mtime_ns for p in out.glob("*.tar")] == times
+
+
+def test_a_shard_of_other_objects_is_made_again(assets: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "pairs"
+    render_training_pairs.run(*assets, CONFIG, out)
+    before = shards(out)
+    index = read_json(out / "pairs-000000.json")
+    index["keys"][0] = "stranger_0"
+    (out / "pairs-000000.json").write_text(json.dumps(index))
+    render_training_pairs.run(*assets, CONFIG, out)
+    assert shards(out) == before
+
+
+def test_packing_twice_changes_nothing(
+    assets: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, real = tmp_path / "pairs", render_training_pairs.pack_shard
+
+    def pack_twice(task: Any) -> Any:
+        first = real(task)
+        times = (out / f"{task.shard}.tar").stat().st_mtime_ns
+        assert real(task) == first and (out / f"{task.shard}.tar").stat().st_mtime_ns == times
+        return first
+
+    monkeypatch.setattr(render_training_pairs, "pack_shard", pack_twice)
+    render_training_pairs.run(*assets, CONFIG, out)
+    assert not (out / "staging").exists()
+
+
+def test_a_crash_costs_one_view(assets: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A worker that dies at the second view of the cube; first and third are rendered all the same."""
+    config = replace(CONFIG, views=replace(VIEWS, num_views=3), choice=ObjectChoice(excluded=("broken",)))
+    real = render_training_pairs.render_object
+
+    def dying(task: Any) -> Any:
+        plan = training_shards.read_plan(task.out, task.plan)
+        folder = tmp_path / "out" / "staging" / plan.shard_name(task.index)
+        if plan.objects[task.index].id != "cube" or (folder / "cube_1.json").exists():
+            return real(task)
+        views = training_shards.render_views
+        monkeypatch.setattr(training_shards, "render_views", lambda *a: itertools.islice(views(*a), 1))
+        real(task)
+        monkeypatch.setattr(training_shards, "render_views", views)
+        return Crash("killed by the test")
+
+    monkeypatch.setattr(render_training_pairs, "render_object", dying)
+    render_training_pairs.run(*assets, config, tmp_path / "out")
+    manifest = read_json(tmp_path / "out" / "manifest.json")
+    assert manifest["left_out"] == {"cube_1": {"reason": "crash", "message": "killed by the test"}}
+    assert manifest["num_items"] == 8
+
+
+def test_where_nothing_can_be_rendered_the_run_stops(assets: tuple[Path, Path], tmp_path: Path) -> None:
+    config = replace(CONFIG, choice=ObjectChoice(excluded=("ball", "cone", "cube")))
+    with pytest.raises(UserError, match="not one object could be rendered.*broken.glb"):
+        render_training_pairs.run(*assets, config, tmp_path / "a")
+    assert not (tmp_path / "a" / "DONE").exists()
+    for index in range(25):
+        (assets[0] / f"a{index}.glb").write_bytes(b"nothing")
+    many = replace(CONFIG, choice=ObjectChoice(excluded=("ball", "cone", "cube")))
+    with pytest.raises(UserError, match="not one object could be rendered"):
+        render_training_pairs.run(*assets, many, tmp_path / "b")
+    assert not list((tmp_path / "b").glob("*.tar")) or len(list((tmp_path / "b").glob("*.tar"))) < 13
+
+
+def test_odd_names_and_dangling_links(assets: tuple[Path, Path], tmp_path: Path) -> None:
+    write_object(assets[0], "chair.v2 [b]", trimesh.creation.box())
+    write_object(assets[0], "n" * 200, trimesh.creation.box())
+    (assets[0] / "gone.glb").symlink_to(tmp_path / "nowhere.glb")
+    out = tmp_path / "pairs"
+    with pytest.raises(UserError, match=r"gone\.glb"):
+        render_training_pairs.run(*assets, CONFIG, out)
+    (assets[0] / "gone.glb").unlink()
+    render_training_pairs.run(*assets, CONFIG, tmp_path / "again")
+    keys = [key for key, _, _ in iterate_items(tmp_path / "again")]
+    assert "chair_v2__b__0" in keys and any(key.startswith("n" * 100) and len(key) < 130 for key in keys)
+
+
+def test_a_folder_of_something_else_is_left_alone(assets: tuple[Path, Path], tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    (home / "other_run").mkdir(parents=True)
+    half_written = home / "other_run" / ".x.partial.exr"
+    half_written.write_bytes(b"being written")
+    with pytest.raises(UserError, match="not a run of this program; got other_run"):
+        render_training_pairs.run(*assets, CONFIG, home)
+    assert half_written.exists() and sorted(p.name for p in home.iterdir() if p.name != ".lock") == ["other_run"]
 
 
 def test_a_damaged_staged_item_is_made_again(

@@ -5,6 +5,8 @@ import signal
 import time
 from pathlib import Path
 
+from illuminerf.workflow.task_pool import alive
+
 
 def square(value: int) -> int:
     return value * value
@@ -31,5 +33,18 @@ def sleep(seconds: float) -> float:
     return seconds
 
 
-def threads(_: int) -> str:
-    return os.environ["OMP_NUM_THREADS"]
+def sleep_alive(seconds: float) -> float:
+    for _ in range(5):
+        time.sleep(seconds / 5)
+        alive()
+    return seconds
+
+
+def run_out_of_memory(_: int) -> None:
+    raise MemoryError
+
+
+def threads(_: int) -> int:
+    import torch
+
+    return torch.get_num_threads()

@@ -1,11 +1,12 @@
 """All views of one object, as training samples: the unit of work of `render_training_pairs`.
 
-What an item looks like depends on the settings, the seed and the item's name alone, never on who makes it or when.
+What an item looks like depends on the settings, the seed, the item's name, the collection and the lights that are
+drawn from, never on who makes it or when.
 """
 
 import functools
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +16,6 @@ import numpy as np
 from illuminerf.cues.blender_renderer import BlenderFailed, BlenderItemRenderer, worker_command
 from illuminerf.cues.broken_object import BrokenObject
 from illuminerf.cues.item_renderer import ItemRenderer, MitsubaItemRenderer
-from illuminerf.cues.light_library import load_light
 from illuminerf.cues.materials import Parts
 from illuminerf.cues.mitsuba_variant import load_mitsuba
 from illuminerf.cues.object_files import ObjectReading, load_object
@@ -23,13 +23,14 @@ from illuminerf.cues.renderer import CueSampling
 from illuminerf.cues.training_cameras import CameraSphere, draw_camera
 from illuminerf.cues.training_lights import LightVariation, draw_light
 from illuminerf.cues.variations import MaterialVariation, varied
+from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.relighting_pairs import encode_item
 from illuminerf.workflow.config import to_json
 from illuminerf.workflow.device import derived_seed, numpy_generator
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.shards import LeftOut
 
-_OBJECTS_IN_MEMORY = 8
+_OBJECTS_IN_MEMORY = 2  # textures can take half a GB each
 
 
 @dataclass(frozen=True)
@@ -86,12 +87,16 @@ class ViewSettings:
             bakes_textures=False,
         )
 
-    def check_renderer(self) -> None:
-        """Raise a UserError where the path tracer is not installed."""
+    def check_renderer(self) -> str:
+        """What renders here; all machines of a run must say the same, since noise differs between them.
+
+        Raises:
+            UserError: the path tracer is not installed.
+        """
         if self.renderer == "blender":
             worker_command(self.blender, Path())
-        else:
-            load_mitsuba(self.cue_sampling.device)
+            return "blender"
+        return str(load_mitsuba(self.cue_sampling.device).variant())
 
     def item_renderer(self) -> ItemRenderer:
         """The path tracer."""
@@ -120,14 +125,18 @@ def item_key(object_id: str, view: int) -> str:
 
 
 def render_views(
-    objects: list[ObjectFile], index: int, lights: list[Path], settings: ViewSettings, views: list[int]
+    objects: Sequence[ObjectFile],
+    index: int,
+    lights: Sequence[EnvironmentMap],
+    settings: ViewSettings,
+    views: list[int],
 ) -> Iterator[tuple[int, dict[str, bytes] | LeftOut]]:
     """Render some views of one object of a collection.
 
     Args:
         objects: the whole collection, from which textures and neighbours are drawn.
         index: which object.
-        lights: the maps to draw from.
+        lights: the maps to draw from, of one resolution.
         settings: what is rendered.
         views: which of its views.
 
@@ -143,7 +152,7 @@ def render_views(
     for view in views:
         try:
             yield view, _rendered(parts, objects, index, lights, settings, view)
-        except (BlenderFailed, RuntimeError, ValueError, ArithmeticError, MemoryError) as error:
+        except (BlenderFailed, RuntimeError, ValueError, ArithmeticError) as error:
             # what a renderer says of an odd mesh; errors of disks and settings are other UserErrors and go on up
             yield view, LeftOut("not rendered", f"{type(error).__name__}: {error}".splitlines()[0])
 
@@ -154,12 +163,17 @@ def _loaded(item: ObjectFile, seed: int, reading: ObjectReading) -> Parts:
 
 
 def _rendered(
-    parts: Parts, objects: list[ObjectFile], index: int, lights: list[Path], settings: ViewSettings, view: int
+    parts: Parts,
+    objects: Sequence[ObjectFile],
+    index: int,
+    lights: Sequence[EnvironmentMap],
+    settings: ViewSettings,
+    view: int,
 ) -> dict[str, bytes] | LeftOut:
     item, key = objects[index], item_key(objects[index].id, view)
     generator = numpy_generator(settings.seed, "item", key)
     of_cameras, of_lights, of_materials = generator.spawn(3)
-    used = {item.id: item}
+    drawn = {item.id: item}
 
     def draw_other(generator: np.random.Generator) -> tuple[str, Parts] | None:
         other = objects[int(generator.integers(len(objects)))]
@@ -169,14 +183,15 @@ def _rendered(
             found = _loaded(other, settings.seed, settings.reading)
         except BrokenObject:
             return None
-        used[other.id] = other
+        drawn[other.id] = other
         return other.id, found
 
-    varied_parts, variations = varied(parts, settings.materials, of_materials, draw_other)
+    varied_parts, variations, donors = varied(parts, settings.materials, of_materials, draw_other)
+    used = [drawn[name] for name in sorted({item.id, *donors})]
     vertices = np.concatenate([mesh.vertices[np.unique(mesh.faces)] for mesh, _ in varied_parts])
     camera = draw_camera(settings.cameras, settings.size, vertices, of_cameras)
     chosen = of_lights.choice(len(lights), settings.num_lights, replace=False)
-    draws = [draw_light(load_light(lights[i], settings.light_height), of_lights, settings.lights) for i in chosen]
+    draws = [draw_light(lights[int(i)], of_lights, settings.lights) for i in chosen]
     seed = derived_seed(settings.seed, "render", key)
     rendered = settings.item_renderer().render(varied_parts, camera, [light for light, _ in draws], seed)
     if not (np.isfinite(rendered.targets).all() and np.isfinite(rendered.cues).all()):
@@ -189,7 +204,7 @@ def _rendered(
         "view": view,
         "split": settings.split,
         "variations": variations,
-        "licences": {name: other.licence for name, other in sorted(used.items()) if other.licence},
+        "licences": {other.id: other.licence for other in used if other.licence},
         "lights": [to_json(draw) for _, draw in draws],
         "camera": camera.to_dict(),
         "coverage": float(rendered.alpha.mean()),

@@ -7,15 +7,17 @@ An item that is rendered waits in `staging/<shard>/<key>.item` (its sha256, then
 import functools
 import hashlib
 import json
+import platform
 from dataclasses import dataclass
-from pathlib import Path
 
+from illuminerf.cues.light_library import StoredLights
 from illuminerf.cues.object_views import ObjectFile, ViewSettings, item_key, render_views
 from illuminerf.scene.relighting_pairs import PREFIX
 from illuminerf.workflow.config import from_json, to_json
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.shards import LeftOut, ShardIndex, sample_tar, write_shard
+from illuminerf.workflow.shards import LeftOut, ShardIndex, is_intact, read_index, sample_tar, write_shard
 from illuminerf.workflow.storage import Storage
+from illuminerf.workflow.task_pool import alive
 
 _DIGEST_BYTES = 32
 
@@ -27,11 +29,13 @@ class Plan:
     objects: tuple[ObjectFile, ...]
     """In the order in which they are dealt to shards."""
     lights: tuple[str, ...]
-    """Paths of usable maps."""
+    """Names of usable maps in the storage (`light_library.StoredLights`)."""
     views: ViewSettings
     """What is rendered of each object."""
     objects_per_shard: int
     """Objects whose views share one shard."""
+    renderer: str
+    """What the driver renders with, see `ViewSettings.check_renderer`."""
 
     def shard_name(self, index: int) -> str:
         """The shard that an object's items go to."""
@@ -83,12 +87,20 @@ def read_plan(out: str, name: str) -> Plan:
 def render_object(task: ObjectTask) -> dict[str, LeftOut | None]:
     """Render the views of one object that are not staged yet; by key, None or why there is no item."""
     storage, plan = Storage(task.out), read_plan(task.out, task.plan)
+    if (here := plan.views.check_renderer()) != plan.renderer:
+        raise UserError(
+            f"machines of one run must render alike, and {platform.node()} does not",
+            got=here,
+            wanted=plan.renderer,
+            fix="install the same libraries everywhere (for llvm_ad_rgb: libllvm19)",
+        )
     folder, keys = f"staging/{plan.shard_name(task.index)}", plan.keys(task.index)
     staged = set(storage.names(folder))
     views = [view for view, key in enumerate(keys) if not staged & {f"{key}.item", f"{key}.json"}]
     result: dict[str, LeftOut | None] = {key: None for key in keys}
-    lights = [Path(path) for path in plan.lights]
-    for view, made in render_views(list(plan.objects), task.index, lights, plan.views, views):
+    lights = StoredLights(storage.url, plan.lights)
+    for view, made in render_views(plan.objects, task.index, lights, plan.views, views):
+        alive()
         if isinstance(made, LeftOut):
             result[keys[view]] = made
             storage.write_json(f"{folder}/{keys[view]}.json", to_json(made))
@@ -98,40 +110,62 @@ def render_object(task: ObjectTask) -> dict[str, LeftOut | None]:
     return result
 
 
-def leave_out_missing(storage: Storage, plan: Plan, index: int, why: LeftOut) -> dict[str, LeftOut | None]:
-    """Give up what an object's dead worker had not staged."""
+def leave_out_next(storage: Storage, plan: Plan, index: int, why: LeftOut) -> str | None:
+    """Give up the view that an object's dead workers were at, the first that is not staged; its key."""
     folder = f"staging/{plan.shard_name(index)}"
     staged = set(storage.names(folder))
-    result: dict[str, LeftOut | None] = {}
     for key in plan.keys(index):
         if f"{key}.item" not in staged and f"{key}.json" not in staged:
             storage.write_json(f"{folder}/{key}.json", to_json(why))
-            result[key] = why
-    return result
+            return key
+    return None
 
 
 def pack_shard(task: PackTask) -> ShardIndex | list[int]:
-    """Join the staged items of a shard and write it; or the objects whose staged items are damaged or gone."""
+    """Join the staged items of a shard and write it; or the objects whose staged items are damaged or gone.
+
+    Where the shard is there already, because a worker died before it could say so, only its staging is cleared.
+    """
     storage, plan = Storage(task.out), read_plan(task.out, task.plan)
     folder = f"staging/{task.shard}"
+    if (index := check_shard(task)) is not None:
+        clear_staging(storage, task.shard)
+        return index
     samples: list[bytes] = []
     left_out: dict[str, LeftOut] = {}
     damaged = []
-    for index in plan.shards()[task.shard]:
-        for key in plan.keys(index):
+    for member in plan.shards()[task.shard]:
+        for key in plan.keys(member):
             staged = _staged(storage, folder, key)
             if isinstance(staged, LeftOut):
                 left_out[key] = staged
             elif staged is not None:
                 samples.append(staged)
-            elif index not in damaged:
-                damaged.append(index)
+            elif member not in damaged:
+                damaged.append(member)
     if damaged:
         return damaged
-    index_file = write_shard(storage, task.shard, samples, left_out)
-    for name in storage.names(folder):
-        storage.remove(f"{folder}/{name}")
-    return index_file
+    written = write_shard(storage, task.shard, samples, left_out)
+    clear_staging(storage, task.shard)
+    return written
+
+
+def check_shard(task: PackTask) -> ShardIndex | None:
+    """The index of a shard that is finished, whose bytes are as they were written, and which holds what is planned."""
+    storage, plan = Storage(task.out), read_plan(task.out, task.plan)
+    index = read_index(storage, task.shard)
+    if index is None:
+        return None
+    planned = {key for member in plan.shards()[task.shard] for key in plan.keys(member)}
+    is_as_planned = planned == {*index.keys, *index.left_out}
+    return index if is_as_planned and is_intact(storage, index) else None
+
+
+def clear_staging(storage: Storage, shard: str) -> None:
+    """Remove what waits for a shard that is finished."""
+    for name in storage.names(f"staging/{shard}"):
+        storage.remove(f"staging/{shard}/{name}")
+    storage.remove_empty(f"staging/{shard}")
 
 
 def _staged(storage: Storage, folder: str, key: str) -> bytes | LeftOut | None:

@@ -44,7 +44,7 @@ DrawOther = Callable[[np.random.Generator], tuple[str, Parts] | None]
 
 def varied(
     parts: Parts, variation: MaterialVariation, generator: np.random.Generator, draw_other: DrawOther
-) -> tuple[Parts, list[str]]:
+) -> tuple[Parts, list[str], list[str]]:
     """Vary an object at random.
 
     Args:
@@ -54,9 +54,11 @@ def varied(
         draw_other: gives another object's name and parts, or None where the one that was drawn is broken.
 
     Returns:
-        The parts, again in the unit sphere, and what was done, for example ["texture of crate", "roughness"].
+        The parts, again in the unit sphere; what was done, for example ["texture of crate", "roughness"]; and the
+        names of the other objects that were used.
     """
     done: list[str] = []
+    donors: list[str] = []
     # always drawn, so that switching one variation off leaves the others as they were
     changes, swaps, composes = generator.random(3) < (
         variation.change_probability,
@@ -69,6 +71,7 @@ def varied(
         if texture is not None:
             parts = swapped(parts, texture)
             done.append(f"texture of {donor[0]}")
+            donors.append(donor[0])
     if changes:
         parts, names = changed(parts, own)
         done += names
@@ -78,7 +81,8 @@ def varied(
         if found:
             parts = composed([parts, *(other for _, other in found)], composing)
             done.append("beside " + ", ".join(name for name, _ in found))
-    return parts, done
+            donors += [name for name, _ in found]
+    return parts, done, donors
 
 
 def changed(parts: Parts, generator: np.random.Generator) -> tuple[Parts, list[str]]:

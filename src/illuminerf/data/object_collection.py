@@ -9,6 +9,7 @@ Only names are looked at; reading the models is the business of the renderer.
 """
 
 import csv
+import hashlib
 import json
 import os
 import re
@@ -26,6 +27,7 @@ _LIST_SUFFIXES = (".txt", ".csv", ".json")
 _VERSION_FOLDER = "hf-objaverse-v1"
 _MAX_LIST_BYTES = 512 * 2**20
 _ID_COLUMNS = ("uid", "id", "object_id")
+_LONGEST_NAME = 100
 _SHARD = re.compile(r"\d{3}-\d{3}")
 
 
@@ -34,7 +36,7 @@ class CollectionObject:
     """One model of a collection.
 
     Attributes:
-        id: unique in the collection, made of letters, digits, `.`, `-` and `_`, so that files may be named by it.
+        id: unique in the collection, made of a hundred or so letters, digits, `-` and `_`: files are named by it.
         path: the model file.
         licence: terms and author, "" where nothing is known.
     """
@@ -74,6 +76,7 @@ def list_objects(source: Path, choice: ObjectChoice | None = None) -> list[Colle
         root, found = _listed(source, choice)
     else:
         found = _named(source)
+        _refuse_unknown(found, choice.excluded)
     if not found:
         raise UserError(f"{source} holds no objects", wanted=_wanted())
     chosen = _chosen(found, choice)
@@ -84,6 +87,16 @@ def list_objects(source: Path, choice: ObjectChoice | None = None) -> list[Colle
             fix="check the ids against the names of the files",
         )
     return _with_licences(source, root, chosen)
+
+
+def _refuse_unknown(found: list[tuple[str, Path]], excluded: tuple[str, ...]) -> None:
+    unknown = set(excluded) - {name for name, _ in found} - {path.stem for _, path in found}
+    if unknown:
+        raise UserError(
+            "objects to leave out are not in the collection",
+            got=", ".join(sorted(unknown)[:5]),
+            wanted="names of files without suffix, or ids as a manifest shows them",
+        )
 
 
 def _wanted() -> str:
@@ -188,7 +201,10 @@ def _models_under(folder: Path) -> Iterator[Path]:
 
 
 def _safe(name: str) -> str:
-    return re.sub(r"[^\w.\-]", "_", name, flags=re.ASCII)
+    safe = re.sub(r"[^\w\-]", "_", name, flags=re.ASCII)
+    if len(safe) <= _LONGEST_NAME:
+        return safe
+    return f"{safe[:_LONGEST_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
 
 
 def _downloaded(root: Path) -> list[tuple[str, Path]]:
@@ -213,7 +229,8 @@ def _listed(source: Path, choice: ObjectChoice) -> tuple[Path, list[tuple[str, P
     if choice.keep_ids is not None:
         keep = set(read_ids(choice.keep_ids))
         ids = [uid for uid in ids if uid in keep]
-    ids = [uid for uid in ids if uid not in set(choice.excluded)]
+    excluded = set(choice.excluded)
+    ids = [uid for uid in ids if uid not in excluded]
     paths = object_paths(root, set(ids))
     absent = [uid for uid in ids if uid not in paths or not paths[uid].is_file()]
     if absent:

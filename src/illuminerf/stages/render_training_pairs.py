@@ -14,17 +14,19 @@ import json
 import time
 from collections import Counter
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from illuminerf.cues.light_library import light_paths, load_light
+from illuminerf.cues.light_library import light_names, light_paths, store_light
 from illuminerf.cues.object_views import ObjectFile, ViewSettings
 from illuminerf.cues.training_shards import (
     ObjectTask,
     PackTask,
     Plan,
-    leave_out_missing,
+    check_shard,
+    clear_staging,
+    leave_out_next,
     pack_shard,
     render_object,
 )
@@ -34,12 +36,15 @@ from illuminerf.workflow.config import to_json
 from illuminerf.workflow.device import numpy_generator
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import StepProgress, say, step_progress
-from illuminerf.workflow.shards import LeftOut, ShardIndex, is_intact, read_index, remove_shard
+from illuminerf.workflow.shards import LeftOut, ShardIndex, remove_shard
 from illuminerf.workflow.storage import Storage
 from illuminerf.workflow.task_pool import Crash, Execution, TaskPool, open_pool
 
 STAGE = "render_training_pairs"
 SCHEMA = 2
+_LIGHTS = "staging/lights"
+_MAY_BE_THE_MACHINE = ("unreadable", "not rendered", "crash")
+_FIRST_OBJECTS = 20
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ class Config:
 
     def __post_init__(self) -> None:
         if self.objects_per_shard < 1:
-            raise UserError("objects_per_shard must be at least 1")
+            raise UserError("objects_per_shard is too small", got=str(self.objects_per_shard), wanted="1 or more")
 
     @staticmethod
     def paper() -> "Config":
@@ -77,80 +82,97 @@ def run(objects: Path, lights: Path, config: Config, out: str | Path, execution:
     Raises:
         UserError: there are no objects or too few lights, `out` was made with other settings, or it cannot be written.
     """
-    execution = execution or Execution()
-    config.views.check_renderer()
+    execution = execution or Execution(workers=0)
+    renderer = config.views.check_renderer()
     storage = Storage(out)
-    collection = _objects(objects, config.choice)
-    usable, unusable_lights = _usable_lights(lights, config.views)
+    storage.check_reachable()
+    collection, maps = _objects(objects, config.choice), light_paths(lights)
     order = numpy_generator(config.views.seed, "order of objects").permutation(len(collection))
-    plan = Plan(
-        tuple(collection[i] for i in order), tuple(str(path) for path in usable), config.views, config.objects_per_shard
-    )
-    key = {"schema": SCHEMA, "stage": STAGE, "config": to_json(config)}
-    made_from = {"objects": _collection_digest(collection), "lights": fingerprint(lights)}
+    in_order = tuple(collection[i] for i in order)
+    plan = Plan(in_order, (), config.views, config.objects_per_shard, renderer)
+    key = {"schema": SCHEMA, "stage": STAGE, "config": to_json(_keyed(config))}
+    made_from = {"objects": _collection_digest(collection), "lights": _lights_digest(maps)}
     start = time.monotonic()
     with locked(storage.path) if storage.path else nullcontext():
         _check_key(storage, key, made_from)
         storage.remove_leftovers()
         storage.write_json("config.json", key)
         storage.write_json("inputs.json", made_from)
-        finished = _finished(storage, plan)
-        if len(finished) < len(plan.shards()) or not storage.exists("DONE"):
+        with open_pool(execution) as pool:
+            finished = _finished(storage, plan, pool)
+            if len(finished) == len(plan.shards()) and _is_sealed(storage):
+                return out
             storage.remove("DONE")
-            finished |= _render_missing(storage, plan, set(finished), execution)
-            manifest = _manifest(plan, config, finished, unusable_lights)
-            storage.write_json("manifest.json", manifest)
-            rendered = {name: manifest[name] for name in ("num_items", "num_ordered_pairs", "left_out_by_reason")}
-            storage.write_json("provenance.json", provenance(time.monotonic() - start, rendered))
-            storage.write("DONE", (hashlib.sha256(storage.read("manifest.json")).hexdigest() + "\n").encode())
+            usable, unusable = _store_lights(storage, maps, config.views)
+            plan = replace(plan, lights=usable)
+            finished |= _render_missing(storage, plan, set(finished), pool)
+        manifest = _manifest(plan, config, finished, unusable)
+        if not manifest["num_items"]:
+            raise _nothing_rendered(storage, *(why["message"] for why in manifest["left_out"].values()))
+        _clear(storage, plan)
+        storage.write_json("manifest.json", manifest)
+        rendered = {name: manifest[name] for name in ("num_items", "num_ordered_pairs", "left_out_by_reason")}
+        storage.write_json("provenance.json", provenance(time.monotonic() - start, rendered))
+        storage.write("DONE", _digest(storage, "manifest.json"))
     return out
 
 
+def _keyed(config: Config) -> Config:
+    """The config without what says where things are and changes no result."""
+    sampling = replace(config.views.cue_sampling, device="auto")
+    return replace(config, views=replace(config.views, blender="", cue_sampling=sampling))
+
+
 def _objects(source: Path, choice: ObjectChoice) -> list[ObjectFile]:
-    """The collection, with ids that may be keys of samples: a dot would end a key."""
-    found, taken = [], set()
-    for item in list_objects(source, choice):
-        identity = item.id.replace(".", "-")
-        while identity in taken:
-            identity += "-"
-        taken.add(identity)
-        found.append(ObjectFile(identity, str(item.path), item.licence))
-    return found
+    """The collection, with absolute paths for workers elsewhere."""
+    return [ObjectFile(item.id, str(item.path.absolute()), item.licence) for item in list_objects(source, choice)]
 
 
 def _collection_digest(collection: list[ObjectFile]) -> str:
-    """Names and sizes; contents are hashed when they are read, and recorded in each item."""
-    lines = (f"{item.id}\0{Path(item.path).stat().st_size}\n" for item in collection)
-    return hashlib.sha256("".join(sorted(lines)).encode()).hexdigest()
+    """Names, sizes and licences in order; contents are hashed when they are read, and recorded in each item."""
+    lines = (f"{item.id}\0{_size(Path(item.path))}\0{item.licence}\n" for item in collection)
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
-def _usable_lights(folder: Path, settings: ViewSettings) -> tuple[list[Path], dict[str, str]]:
-    """Maps that can light a scene, and what is wrong with the others by name."""
-    paths = light_paths(folder)
+def _size(path: Path) -> int:
+    """Of a file; -1 where it cannot be seen, which whoever renders it will explain."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return -1
+
+
+def _lights_digest(paths: list[Path]) -> str:
+    return hashlib.sha256("".join(f"{path.name}\0{fingerprint(path)}\n" for path in paths).encode()).hexdigest()
+
+
+def _store_lights(
+    storage: Storage, paths: list[Path], settings: ViewSettings
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Put maps that can light a scene where workers find them; their names, and what is wrong with the others."""
     usable, unusable = [], {}
-    with step_progress("check lights", len(paths)) as progress:
+    with step_progress("prepare lights", len(paths)) as progress:
         for path in paths:
             try:
-                load_light(path, settings.light_height)
-                usable.append(path)
+                usable.append(store_light(storage, _LIGHTS, path, settings.light_height))
             except UserError as error:
                 unusable[path.stem] = str(error)
                 say(f"the light {path.stem} is left out: {error}")
             progress.advance()
     if len(usable) < settings.num_lights:
         raise UserError(
-            f"{folder} holds too few lights",
+            "there are too few lights",
             got=f"{len(usable)} usable and {len(unusable)} unusable maps",
             wanted=f"{settings.num_lights} .exr or .hdr maps",
         )
-    return usable, unusable
+    return tuple(usable), unusable
 
 
 def _check_key(storage: Storage, key: dict[str, Any], made_from: dict[str, str]) -> None:
     try:
         old_key, old_inputs = (json.loads(storage.read(name)) for name in ("config.json", "inputs.json"))
     except (FileNotFoundError, ValueError):
-        strangers = [name for name in storage.names() if name not in ("config.json", "inputs.json", ".lock")]
+        strangers = [name for name, _ in storage.entries() if name not in ("config.json", "inputs.json", ".lock")]
         if strangers:
             raise UserError(
                 f"{storage.url} holds files that are not a run of this program",
@@ -161,43 +183,66 @@ def _check_key(storage: Storage, key: dict[str, Any], made_from: dict[str, str])
     refuse_other_key(storage.url, old_key, key, old_inputs, made_from)
 
 
-def _finished(storage: Storage, plan: Plan) -> dict[str, ShardIndex]:
+def _digest(storage: Storage, name: str) -> bytes:
+    return (hashlib.sha256(storage.read(name)).hexdigest() + "\n").encode()
+
+
+def _is_sealed(storage: Storage) -> bool:
+    """Whether the run said that it is finished, and its manifest is what it wrote."""
+    try:
+        return storage.read("DONE") == _digest(storage, "manifest.json")
+    except FileNotFoundError:
+        return False
+
+
+def _finished(storage: Storage, plan: Plan, pool: TaskPool) -> dict[str, ShardIndex]:
     """Shards whose bytes are as they were written; damaged ones are taken away, to be made again."""
-    finished = {}
-    names = plan.shards()
-    with step_progress("check shards", len(names)) as progress:
-        for name in names:
-            index = read_index(storage, name)
-            if index is not None and is_intact(storage, index):
-                finished[name] = index
-            elif index is not None:
-                say(f"{storage.url}/{name}.tar is damaged or missing, and is made again")
-                remove_shard(storage, name)
+    present = {name.removesuffix(".json") for name in storage.names()} & set(plan.shards())
+    if not present:
+        return {}
+    plan_file, finished = plan.write(storage), {}
+    with step_progress("check shards", len(present)) as progress:
+        for name in sorted(present):
+            pool.submit(check_shard, PackTask(storage.url, plan_file, name))
+        for _ in present:
+            task, index = pool.next_done()
+            if isinstance(index, ShardIndex):
+                finished[task.shard] = index
+            else:
+                say(f"{storage.url}/{task.shard}.tar is damaged or missing, and is made again")
+                remove_shard(storage, task.shard)
             progress.advance()
+    storage.remove(plan_file)
     return finished
 
 
-def _render_missing(storage: Storage, plan: Plan, finished: set[str], execution: Execution) -> dict[str, ShardIndex]:
+def _render_missing(storage: Storage, plan: Plan, finished: set[str], pool: TaskPool) -> dict[str, ShardIndex]:
     """Render and pack all shards that are not finished."""
-    plan_file = plan.write(storage)
-    made: dict[str, ShardIndex] = {}
     shards = {name: members for name, members in plan.shards().items() if name not in finished}
-    per_object = plan.views.num_views
-    num_items = len(plan.objects) * per_object
-    done = num_items - per_object * sum(map(len, shards.values()))
-    with step_progress("render training pairs", num_items, done) as progress, open_pool(execution) as pool:
+    num_items = len(plan.objects) * plan.views.num_views
+    done = num_items - plan.views.num_views * sum(map(len, shards.values()))
+    for name in shards:
+        storage.remove_leftovers(f"staging/{name}")
+    with step_progress("render training pairs", num_items, done) as progress:
         waiting = iter([index for members in shards.values() for index in members])
-        driver = _Driver(storage, plan, plan_file, pool, progress, {name: set(m) for name, m in shards.items()}, made)
+        missing = {name: set(members) for name, members in shards.items()}
+        driver = _Driver(storage, plan, plan.write(storage), pool, progress, missing)
         while True:
             while pool.num_running() < pool.capacity and (index := next(waiting, None)) is not None:
-                pool.submit(render_object, ObjectTask(storage.url, plan_file, index))
+                driver.render(index)
             if not pool.num_running():
-                break
+                return driver.made
             driver.take(*pool.next_done())
-    storage.remove(plan_file)
-    for folder in (*(f"staging/{name}" for name in shards), "staging"):
+
+
+def _clear(storage: Storage, plan: Plan) -> None:
+    """Remove all that waited."""
+    for shard in plan.shards():
+        clear_staging(storage, shard)
+    for folder in (_LIGHTS, "staging"):
+        for name in storage.names(folder):
+            storage.remove(f"{folder}/{name}")
         storage.remove_empty(folder)
-    return made
 
 
 @dataclass
@@ -211,25 +256,49 @@ class _Driver:
     progress: StepProgress
     missing: dict[str, set[int]]
     """Objects by shard that are still to come."""
-    made: dict[str, ShardIndex]
+    made: dict[str, ShardIndex] = field(default_factory=dict)
     num_left_out: int = 0
+    num_suspicious: int = 0
+    """Objects in a row, from the first, of which nothing could be rendered for reasons that may be the machine's."""
+    num_taken: int = 0
+
+    def render(self, index: int) -> None:
+        """Have what is missing of an object rendered."""
+        self.pool.submit(render_object, ObjectTask(self.storage.url, self.plan_file, index))
 
     def take(self, task: ObjectTask | PackTask, outcome: Any) -> None:
         """Count a finished object or shard; pack a shard when its last object is there."""
         if isinstance(task, PackTask):
             self._packed(task, outcome)
-            return
-        shard = self.plan.shard_name(task.index)
-        if isinstance(outcome, Crash):
-            outcome = leave_out_missing(self.storage, self.plan, task.index, LeftOut("crash", outcome.message))
-        for key, left_out in outcome.items():
-            self.num_left_out += left_out is not None
-            if left_out is not None and key.endswith("_0"):
-                say(f"left out {key}: {left_out.message}")
+        elif isinstance(outcome, Crash):
+            # views are rendered in order: the first that is missing took the workers down, the others may be well
+            key = leave_out_next(self.storage, self.plan, task.index, LeftOut("crash", outcome.message))
+            say(f"left out {key}: {outcome.message}")
+            self.render(task.index)
+        else:
+            self._rendered(task, outcome)
+
+    def _rendered(self, task: ObjectTask, outcome: dict[str, LeftOut | None]) -> None:
+        left_out = [why for why in outcome.values() if why is not None]
+        self.num_left_out += len(left_out)
+        if left_out:
+            say(
+                f"left out {len(left_out)} of {len(outcome)} views of {self.plan.objects[task.index].id}: "
+                f"{left_out[0].message}"
+            )
+        self._check_machine(len(left_out) == len(outcome) and left_out[0].reason in _MAY_BE_THE_MACHINE, left_out)
         self.progress.advance(self.plan.views.num_views, left_out=float(self.num_left_out))
+        shard = self.plan.shard_name(task.index)
         self.missing[shard].discard(task.index)
         if not self.missing[shard]:
             self.pool.submit(pack_shard, PackTask(self.storage.url, self.plan_file, shard))
+
+    def _check_machine(self, is_suspicious: bool, left_out: list[LeftOut]) -> None:
+        """Stop where not one of the first objects can be rendered, before a whole collection is given up."""
+        self.num_suspicious += is_suspicious and self.num_suspicious == self.num_taken
+        self.num_taken += 1
+        if self.num_suspicious == self.num_taken == _FIRST_OBJECTS:
+            raise _nothing_rendered(self.storage, left_out[0].message)
 
     def _packed(self, task: PackTask, outcome: Any) -> None:
         if isinstance(outcome, Crash):
@@ -240,7 +309,16 @@ class _Driver:
         self.missing[task.shard] = set(outcome)
         for index in outcome:  # staged items that are damaged: once more
             say(f"a staged item of {self.plan.objects[index].id} is damaged, and is made again")
-            self.pool.submit(render_object, ObjectTask(self.storage.url, self.plan_file, index))
+            self.progress.advance(-self.plan.views.num_views)
+            self.render(index)
+
+
+def _nothing_rendered(storage: Storage, *messages: str) -> UserError:
+    return UserError(
+        "not one object could be rendered",
+        got=messages[0] if messages else "no objects",
+        fix=f"check that every machine sees the objects and can render, delete {storage.url}, and run again",
+    )
 
 
 def _manifest(
@@ -260,7 +338,7 @@ def _manifest(
         "excluded": sorted(config.choice.excluded),
         "left_out": {key: to_json(why) for key, why in sorted(left_out.items())},
         "left_out_by_reason": dict(sorted(Counter(why.reason for why in left_out.values()).items())),
-        "lights": sorted(Path(path).stem for path in plan.lights),
+        "lights": light_names(plan.lights),
         "lights_left_out": dict(sorted(unusable_lights.items())),
         "licences": {item.id: item.licence for item in sorted(plan.objects, key=lambda item: item.id) if item.licence},
     }

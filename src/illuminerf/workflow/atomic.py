@@ -41,9 +41,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def remove_partial_files(folder: Path) -> None:
-    """Delete what a killed process left behind inside `folder`; whole files are never touched."""
-    for leftover in folder.rglob(".*.partial*"):
+def remove_partial_files(folder: Path, deep: bool = True) -> None:
+    """Delete what a killed process left behind inside `folder` (and below); whole files are never touched."""
+    for leftover in (folder.rglob if deep else folder.glob)(".*.partial*"):
         leftover.unlink(missing_ok=True)
 
 

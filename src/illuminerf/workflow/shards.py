@@ -107,11 +107,13 @@ def write_shard(storage: Storage, name: str, samples: list[bytes], left_out: dic
 
 
 def read_index(storage: Storage, name: str) -> ShardIndex | None:
-    """The index of a shard; None where it is absent or unreadable, so that the shard counts as unfinished."""
+    """The index of a shard; None where it is absent, unreadable or of another layout, so that the shard counts as
+    unfinished."""
     try:
-        return from_json(ShardIndex, json.loads(storage.read(f"{name}.json")))
+        index = from_json(ShardIndex, json.loads(storage.read(f"{name}.json")))
     except (FileNotFoundError, ValueError, UserError):
         return None
+    return index if index.schema == INDEX_SCHEMA and index.name == name else None
 
 
 def is_intact(storage: Storage, index: ShardIndex) -> bool:
@@ -131,10 +133,10 @@ def remove_shard(storage: Storage, name: str) -> None:
     storage.remove(f"{name}.tar")
 
 
-def finished_shards(storage: Storage, folder: str = "") -> list[ShardIndex]:
+def finished_shards(storage: Storage) -> list[ShardIndex]:
     """Indices of all finished shards directly in the storage, by name."""
-    stems = {name.removesuffix(".tar") for name in storage.names(folder) if name.endswith(".tar")}
-    indices = (read_index(storage, f"{folder}/{stem}" if folder else stem) for stem in sorted(stems))
+    stems = {name.removesuffix(".tar") for name in storage.names() if name.endswith(".tar")}
+    indices = (read_index(storage, stem) for stem in sorted(stems))
     return [index for index in indices if index is not None]
 
 

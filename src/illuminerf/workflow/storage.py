@@ -37,6 +37,8 @@ class Storage:
                 fix="install the package of that file system, for example pip install s3fs",
             ) from error
         self._root = self._root.rstrip("/") or "/"
+        if isinstance(self._fs, LocalFileSystem):
+            self.url = self._root  # absolute: workers elsewhere have another current folder
 
     @property
     def path(self) -> Path | None:
@@ -59,8 +61,11 @@ class Storage:
             write_bytes(Path(path), content)
             return
         try:
-            self._fs.makedirs(path.rpartition("/")[0], exist_ok=True)
-            self._fs.pipe_file(path, content)
+            try:
+                self._fs.pipe_file(path, content)
+            except FileNotFoundError:  # file systems with real folders
+                self._fs.makedirs(path.rpartition("/")[0], exist_ok=True)
+                self._fs.pipe_file(path, content)
         except OSError as error:
             full = error.errno in (errno.ENOSPC, errno.EDQUOT)
             raise UserError(
@@ -97,14 +102,36 @@ class Storage:
         return bool(self._fs.exists(self._path(name)))
 
     def names(self, folder: str = "") -> list[str]:
-        """Names of the files directly in `folder`, sorted, without the folder; none where it does not exist."""
+        """Names of the visible files directly in `folder`, sorted, without it; none where it does not exist."""
+        return [name for name, kind in self.entries(folder) if kind == "file" and not name.startswith(".")]
+
+    def entries(self, folder: str = "") -> list[tuple[str, str]]:
+        """(name, "file" or "directory") of everything directly in `folder`, sorted; none where it does not exist."""
         self._fs.invalidate_cache()
+        path = self._path(folder)
         try:
-            entries = self._fs.ls(self._path(folder), detail=True)
+            found = self._fs.ls(path, detail=True)
         except FileNotFoundError:
             return []
-        files = (entry["name"].rpartition("/")[2] for entry in entries if entry["type"] == "file")
-        return sorted(name for name in files if name and not name.startswith("."))
+        named = ((entry["name"].rstrip("/").rpartition("/")[2], entry) for entry in found)
+        return sorted(
+            (name, entry["type"]) for name, entry in named if name and entry["name"].strip("/") != path.strip("/")
+        )
+
+    def check_reachable(self) -> None:
+        """Ask the file system once, so that wrong addresses and credentials are found before any work is done.
+
+        Raises:
+            UserError: it does not answer.
+        """
+        try:
+            self._fs.exists(self._root)
+        except Exception as error:  # every file system has errors of its own
+            raise UserError(
+                f"{self.url} cannot be reached",
+                got=f"{type(error).__name__}: {error}".splitlines()[0],
+                fix="check the address, the network and the credentials",
+            ) from error
 
     def remove(self, name: str) -> None:
         """Delete a file; no error where there is none."""
@@ -118,7 +145,7 @@ class Storage:
         if self.path and (path := Path(self._path(folder))).is_dir() and not any(path.iterdir()):
             path.rmdir()
 
-    def remove_leftovers(self) -> None:
-        """Delete what a killed process had half written; whole files are never touched."""
-        if self.path and self.path.is_dir():
-            remove_partial_files(self.path)
+    def remove_leftovers(self, folder: str = "") -> None:
+        """Delete what a killed process had half written directly in a folder; whole files are never touched."""
+        if self.path and (path := Path(self._path(folder))).is_dir():
+            remove_partial_files(path, deep=False)

@@ -1,7 +1,8 @@
 """Many independent tasks: in this process, in many processes, or on many machines with Ray, by the same code.
 
 A worker that dies (a crash in native code, a lost machine, the out-of-memory killer) costs the task it was at: the
-task is tried again elsewhere, and reported as `Crash` when it keeps failing. Errors that are raised are not retried.
+task is tried again elsewhere, and reported as `Crash` when it keeps failing. So does one that runs out of memory, or
+goes on for too long without a sign of life (`alive`). Other errors that are raised are not retried.
 """
 
 import faulthandler
@@ -12,33 +13,44 @@ import socket
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TextIO, runtime_checkable
+
+from pebble import ProcessExpired, ProcessPool
 
 from illuminerf.workflow.errors import UserError
 
 _CONNECT_SECONDS = 5.0
+_OUT_OF_MEMORY = 137
+_THREAD_SETTINGS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "ILLUMINERF_RENDER_THREADS")
 
 
 @dataclass(frozen=True)
 class Execution:
     """Where tasks run; it never changes what they make."""
 
-    workers: int = 0
-    """Processes; 0 runs everything in this one. With Ray, tasks at once (0: as many as the cluster has cores)."""
+    workers: int | None = None
+    """Processes (with Ray: tasks at once); None: as many as this machine or the cluster has cores; 0, without Ray:
+    everything in this process."""
     ray_address: str = ""
     """Address of a Ray cluster, "auto" for the one this machine belongs to, "" for no Ray."""
     attempts: int = 3
     """How often a task may take its worker down before it is given up."""
     task_seconds: float = 1800.0
-    """A task that takes longer has its worker ended."""
+    """A task without a sign of life for so long has its worker ended."""
     tasks_per_worker: int = 200
     """A process is replaced after so many tasks, so that leaks of libraries cannot add up."""
 
     def __post_init__(self) -> None:
-        if self.workers < 0 or self.attempts < 1 or self.task_seconds <= 0 or self.tasks_per_worker < 1:
-            raise UserError("workers, attempts, task_seconds and tasks_per_worker must be positive")
+        if (self.workers or 0) < 0 or self.attempts < 1 or self.task_seconds <= 0 or self.tasks_per_worker < 1:
+            raise UserError(
+                "a setting of the workers is out of range",
+                got=f"workers {self.workers}, attempts {self.attempts}, task_seconds {self.task_seconds:g}, "
+                f"tasks_per_worker {self.tasks_per_worker}",
+                wanted="workers of 0 or more, the others above 0",
+            )
 
 
 @dataclass(frozen=True)
@@ -77,10 +89,15 @@ def open_pool(execution: Execution) -> Iterator[TaskPool]:
     """
     if execution.ray_address:
         yield from _ray_pool(execution)
-    elif execution.workers:
-        yield from _process_pool(execution)
-    else:
+    elif execution.workers == 0:
         yield _InProcessPool()
+    else:
+        yield from _process_pool(execution, execution.workers or num_cores())
+
+
+def num_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _InProcessPool:
@@ -100,63 +117,107 @@ class _InProcessPool:
         return len(self._waiting)
 
 
-def _guarded(function: Callable[[Any], Any], argument: Any, seconds: float) -> Any:
-    """Run a task under a watchdog that ends this worker process when time is up."""
-    with open(os.devnull, "w") as nowhere:
+_watched: list[tuple[float, TextIO]] = []
+
+
+def alive() -> None:
+    """Called by a task in between: the watchdog of its worker starts anew. Nothing happens outside of a worker."""
+    if _watched:
+        seconds, nowhere = _watched[-1]
         faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
+
+
+def _guarded(function: Callable[[Any], Any], argument: Any, seconds: float) -> Any:
+    """Run a task under a watchdog that ends this worker process when there is no sign of life."""
+    os.environ["ILLUMINERF_TASK_SECONDS"] = str(seconds)  # programs that a task starts must end before it is given up
+    with open(os.devnull, "w") as nowhere:
+        _watched.append((seconds, nowhere))
+        alive()
         try:
             return function(argument)
+        except MemoryError:
+            os._exit(_OUT_OF_MEMORY)  # another worker, or this task later, may have more
         finally:
             faulthandler.cancel_dump_traceback_later()
+            _watched.pop()
 
 
-def _process_pool(execution: Execution) -> Iterator[TaskPool]:
-    from pebble import ProcessPool
-
-    pool = ProcessPool(
-        max_workers=execution.workers,
-        max_tasks=execution.tasks_per_worker,
-        context=multiprocessing.get_context("spawn"),
-        initializer=_share_cores,
-        initargs=(execution.workers,),
-    )
+def _process_pool(execution: Execution, workers: int) -> Iterator[TaskPool]:
+    # numerical libraries read these when they are imported, so they must be set before a process starts
+    share = str(max(1, num_cores() // workers))
+    before = {name: os.environ.get(name) for name in _THREAD_SETTINGS}
+    os.environ.update(dict.fromkeys(_THREAD_SETTINGS, share))
+    processes = _Processes(execution, workers)
     try:
-        yield _Processes(pool, execution)
+        yield processes
     finally:
-        pool.stop()
-        pool.join()
-
-
-def _share_cores(workers: int) -> None:
-    """Give each worker its share of the machine's threads, before numerical libraries read the setting."""
-    share = str(max(1, (os.cpu_count() or 1) // workers))
-    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "ILLUMINERF_RENDER_THREADS"):
-        os.environ[name] = share
+        processes.stop()
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 class _Processes:
-    def __init__(self, pool: Any, execution: Execution) -> None:
-        self._pool, self._execution = pool, execution
-        self.capacity = 2 * execution.workers
+    def __init__(self, execution: Execution, workers: int) -> None:
+        self._execution, self._workers = execution, workers
+        self.capacity = 2 * workers
+        self._num_starts = 0
         self._running: dict[Future[Any], tuple[Callable[[Any], Any], Any, int]] = {}
+        self._start()
+
+    def _start(self) -> None:
+        self._num_starts += 1
+        self._pool = ProcessPool(
+            max_workers=self._workers,
+            max_tasks=self._execution.tasks_per_worker,
+            context=multiprocessing.get_context("spawn"),
+        )
+
+    def stop(self) -> None:
+        self._pool.stop()
+        self._pool.join()
 
     def submit(self, function: Callable[[Any], Any], argument: Any, attempt: int = 1) -> None:
         future = self._pool.schedule(_guarded, args=(function, argument, self._execution.task_seconds))
         self._running[future] = (function, argument, attempt)
 
     def next_done(self) -> tuple[Any, Any]:
-        from pebble import ProcessExpired
-
         while True:
             done, _ = wait(self._running, return_when=FIRST_COMPLETED)
             future = next(iter(done))
-            function, argument, attempt = self._running.pop(future)
+            function, argument, attempt = self._running[future]
             try:
-                return argument, future.result()
+                result = future.result()
+            except BrokenProcessPool as error:
+                self._restart(error)
+                continue
             except ProcessExpired as error:
+                del self._running[future]
                 if attempt >= self._execution.attempts:
                     return argument, Crash(f"the worker died {attempt} times (exit code {error.exitcode})")
                 self.submit(function, argument, attempt + 1)
+                continue
+            except BaseException:
+                del self._running[future]
+                raise
+            del self._running[future]
+            return argument, result
+
+    def _restart(self, error: BrokenProcessPool) -> None:
+        """All processes are gone, before they could take a task: start others."""
+        if self._num_starts >= self._execution.attempts:
+            raise UserError(
+                "worker processes do not start",
+                got=str(error),
+                fix='in a script of your own, guard the call with `if __name__ == "__main__":`; else use --workers 0',
+            ) from error
+        self.stop()
+        waiting, self._running = list(self._running.values()), {}
+        self._start()
+        for function, argument, attempt in waiting:
+            self.submit(function, argument, attempt)
 
     def num_running(self) -> int:
         return len(self._running)
@@ -169,7 +230,7 @@ def _ray_pool(execution: Execution) -> Iterator[TaskPool]:
         raise UserError("Ray is not installed", fix="pip install 'illuminerf[cluster]'") from error
     host, _, port = execution.ray_address.rpartition(":")
     try:
-        if host and port.isdigit():  # Ray itself would keep trying for minutes
+        if host and "/" not in host and port.isdigit():  # Ray itself would keep trying for minutes
             socket.create_connection((host, int(port)), _CONNECT_SECONDS).close()
         ray.init(address=execution.ray_address, log_to_driver=False, ignore_reinit_error=True)
     except (OSError, ValueError, RuntimeError) as error:
@@ -189,7 +250,7 @@ class _RayTasks:
         self._ray, self._execution = ray, execution
         cores = int(ray.cluster_resources().get("CPU", 1))
         self.capacity = 2 * (execution.workers or cores)
-        environment = {"env_vars": {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "ILLUMINERF_RENDER_THREADS": "1"}}
+        environment = {"env_vars": dict.fromkeys(_THREAD_SETTINGS, "1")}
         # Ray retries a task whose worker or machine is lost; errors that the task raises are not retried
         self._remote = ray.remote(
             num_cpus=1,
@@ -210,8 +271,8 @@ class _RayTasks:
         try:
             return argument, self._ray.get(reference)
         except self._ray.exceptions.RayTaskError as error:
-            raise error.as_instanceof_cause() from error
-        except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.NodeDiedError) as error:
+            raise error.cause from error
+        except self._ray.exceptions.RayError as error:
             return argument, Crash(f"the worker died {self._execution.attempts} times ({type(error).__name__})")
 
     def num_running(self) -> int:
