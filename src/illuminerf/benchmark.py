@@ -89,7 +89,7 @@ def tensoir_command(
 
 def relighting_model_command(
     model: tyro.conf.Positional[str],
-    data: tyro.conf.Positional[Path],
+    data: tyro.conf.Positional[str],
     json: Path | None = None,
     pairs: int = 200,
     samples: int = 4,

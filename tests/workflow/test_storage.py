@@ -41,6 +41,17 @@ def test_only_a_local_storage_has_a_path(tmp_path: Path) -> None:
     assert Storage("memory://x").path is None
 
 
+def test_relative_folders_are_made_absolute_for_workers_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    storage = Storage("out/pairs")
+    monkeypatch.chdir("/")
+    assert storage.url == str(tmp_path / "out/pairs")
+    storage.write("a", b"1")
+    assert (tmp_path / "out/pairs/a").exists()
+
+
 def test_an_unknown_protocol_is_explained() -> None:
     with pytest.raises(UserError, match="no place this program can write to"):
         Storage("quantum://bucket")

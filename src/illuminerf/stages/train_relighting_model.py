@@ -47,7 +47,7 @@ _CHECKPOINT = "training.safetensors"
 _GRID_ROWS = ("input", "diffuse_cue", "truth", "anchor", "sample", "mean", "bound")
 
 
-def run(pairs: Path, held_out: Path, config: Config, out: Path) -> Path:
+def run(pairs: str | Path, held_out: str | Path, config: Config, out: Path) -> Path:
     """Train on the items of `pairs`, validate on those of `held_out`; `out` becomes a model folder.
 
     Under torchrun every process calls this; the first one writes.
@@ -92,7 +92,7 @@ def _build(config: Config) -> RelightingModel | ControlledBase:
 class _Training:
     """One process's run."""
 
-    def __init__(self, pairs: Path, held_out: Path, config: Config, out: Path, accelerator: Accelerator) -> None:
+    def __init__(self, pairs: str | Path, held_out: str | Path, config: Config, out: Path, accelerator: Accelerator) -> None:
         self.config, self.pairs, self.held_out, self.out = config, pairs, held_out, out
         self.accelerator = accelerator
         self.items: dict[int, list[TrainingItem]] = {}
