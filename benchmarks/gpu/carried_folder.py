@@ -1,8 +1,8 @@
-"""A model or run folder as a few safetensors files under a size limit, to carry off a machine that lets only small files go.
+"""A model or run folder as a few safetensors files under a size limit, for machines that let only small files go.
 
-`index.json` holds every JSON and text file of the folder and says which piece of which tensor is where; `NNN.safetensors`
-hold the pieces. Tensors are cut where a file is full. `unpack` gives the same tensors, bit by
-bit, and the same texts.
+`index.json` holds every JSON and text file of the folder and says which piece of which tensor is where;
+`NNN.safetensors` hold the pieces. Tensors are cut where a file is full. `unpack` gives the same tensors, bit by bit,
+and the same texts.
 """
 
 import hashlib
@@ -85,10 +85,14 @@ def unpack(carried: Path, folder: Path) -> None:
         index = json.loads((carried / "index.json").read_text())
         contents = {name: (carried / name).read_bytes() for name in index["sha256"]}
     except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"{carried} is not a carried folder", got=str(error), wanted="index.json and its files") from error
+        raise UserError(
+            f"{carried} is not a carried folder", got=str(error), wanted="index.json and its files"
+        ) from error
     for name, content in contents.items():
         if hashlib.sha256(content).hexdigest() != index["sha256"][name]:
-            raise UserError(f"{carried / name} is damaged", got="another sha256 than index.json says", fix="copy it again")
+            raise UserError(
+                f"{carried / name} is damaged", got="another sha256 than index.json says", fix="copy it again"
+            )
     loaded = {name: load(content) for name, content in contents.items()}
     parts: dict[str, dict[str, list[torch.Tensor]]] = {name: {} for name in index["headers"]}
     shapes = {}

@@ -1,10 +1,11 @@
-"""Kernels against their readable twins in float64, and the tests that need a GPU; prints JSON, exit status 1 if one fails.
+"""Kernels against their readable twins in float64, and the tests that need a GPU; prints JSON.
 
 python benchmarks/gpu/check_kernels.py [--device auto] [--points 20000] [--tiny]
 
 Relative errors (largest difference over largest value) between what `HashGrid` runs on the device and
 `hash_grid.interpolate` on the CPU: features, Jacobian, gradient of the table, and the gradient of a loss on normals
 against double backward through the positions. Where there is CUDA, `pytest -m gpu` runs as well.
+Exit status 1 where anything is wrong.
 """
 
 import argparse

@@ -3,8 +3,8 @@
 python benchmarks/gpu/render_pairs.py [OBJECTS LIGHTS] --out OUT [--minutes 8] [--device auto] [--workers 0] [--tiny]
     [-- any option of `illuminerf render-training-pairs`]
 
-Without folders it takes objects and lights made from formulas (written beside OUT). Run the same command again to go on.
-Exit status 1 where a finished shard is damaged or an item does not hold what it must.
+Without folders it takes objects and lights made from formulas (written beside OUT). Run it again to go
+on. Exit status 1 where a finished shard is damaged or an item does not hold what it must.
 """
 
 import argparse
@@ -95,7 +95,8 @@ def render(command: list[str], seconds: float, log: Path) -> str:
         return "time is up"
 
 
-def main() -> None:
+def parsed() -> tuple[argparse.Namespace, list[str]]:
+    """The command line, and what stands after `--`."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="*", metavar="FOLDER", help="OBJECTS and LIGHTS")
     parser.add_argument("--out", type=Path, required=True)
@@ -108,6 +109,22 @@ def main() -> None:
     options, more = parser.parse_args(arguments[:cut]), arguments[cut + 1 :]
     if len(options.folders) not in (0, 2):
         parser.error("name OBJECTS and LIGHTS, or neither")
+    return options, more
+
+
+def asset_folders(options: argparse.Namespace) -> list[Path]:
+    """Those that were named, or made-up ones beside the pairs; they are not written twice, so that runs go on."""
+    if options.folders:
+        return list(options.folders)
+    beside = options.out.parent / f"{options.out.name}_assets"
+    folders = [beside / "objects", beside / "lights"]
+    if not all(folder.is_dir() for folder in folders):
+        write_example_assets(beside, *((32, 16) if options.tiny else ()))
+    return folders
+
+
+def main() -> None:
+    options, more = parsed()
     tried = []
     for device in ("cuda", "cpu") if options.device == "auto" else (options.device,):
         tried.append(probe(device))
@@ -116,15 +133,9 @@ def main() -> None:
     else:
         print(json.dumps({"passed": False, "tried": tried}))
         sys.exit(1)
-    folders = options.folders
-    if not folders:
-        beside = options.out.parent / f"{options.out.name}_assets"
-        folders = [beside / "objects", beside / "lights"]
-        if not all(folder.is_dir() for folder in folders):
-            write_example_assets(beside, *((32, 16) if options.tiny else ()))
     workers = options.workers or (1 if device == "cuda" else os.cpu_count() or 1)
     command = [sys.executable, "-c", "from illuminerf.cli import main; main()", "render-training-pairs"]
-    command += [*map(str, folders)]
+    command += [*map(str, asset_folders(options))]
     command += ["--out", str(options.out), "--workers", str(workers), "--views.cue-sampling.device", device]
     command += (_TINY.split() if options.tiny else []) + more
     before, start = sum(count_items(options.out)), time.monotonic()
