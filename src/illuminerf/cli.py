@@ -13,6 +13,7 @@ from illuminerf import benchmark, demo, models, pipeline
 from illuminerf.data.objaverse_download import download_objaverse
 from illuminerf.data.object_collection import read_ids
 from illuminerf.presets import PRESETS, Preset, customised
+from illuminerf.scene.example_assets import write_example_assets
 from illuminerf.stages import (
     estimate_geometry,
     evaluate_relighting,
@@ -162,6 +163,16 @@ def download_objaverse_command(
     say(f"done: {len(paths)} objects in {root}")
 
 
+def example_assets_command(folder: PositionalPath) -> None:
+    """Write a few objects and lights made from formulas, to try render-training-pairs on.
+
+    Args:
+        folder: Gets objects/*.glb and lights/*.exr.
+    """
+    objects, lights = write_example_assets(folder)
+    say(f"done: {objects}, {lights}")
+
+
 class StageCall:
     """Parsed arguments of one stage's subcommand."""
 
@@ -261,7 +272,11 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 }
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
     "benchmark": {"tensoir": benchmark.tensoir_command},
-    "data": {"preview": preview_command, "download-objaverse": download_objaverse_command},
+    "data": {
+        "preview": preview_command,
+        "download-objaverse": download_objaverse_command,
+        "example-assets": example_assets_command,
+    },
     "models": {
         "list": models.list_command,
         "info": models.info_command,

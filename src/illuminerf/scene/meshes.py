@@ -11,7 +11,7 @@ from illuminerf.workflow.atomic import write_bytes
 from illuminerf.workflow.errors import UserError
 
 # glTF is y-up: (x, y, z) of our z-up world is written as (x, z, -y)
-_GLTF_FROM_WORLD = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
+GLTF_FROM_WORLD = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class TriangleMesh:
         if self.vertex_colors is not None:
             colors = to_uint8(linear_from_srgb(self.vertex_colors))  # glTF vertex colours are linear
         mesh = trimesh.Trimesh(
-            self.vertices @ _GLTF_FROM_WORLD.T,
+            self.vertices @ GLTF_FROM_WORLD.T,
             self.faces,
-            vertex_normals=self.vertex_normals @ _GLTF_FROM_WORLD.T,
+            vertex_normals=self.vertex_normals @ GLTF_FROM_WORLD.T,
             vertex_colors=colors,
             process=False,
         )
@@ -89,7 +89,7 @@ def _placed(scene: trimesh.Scene, node: str) -> tuple[np.ndarray, np.ndarray, np
     vertices = mesh.vertices @ transform[:3, :3].T + transform[:3, 3]
     normals = mesh.vertex_normals @ normal_transform.T
     normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    turned = [np.ascontiguousarray(array @ _GLTF_FROM_WORLD, np.float32) for array in (vertices, normals)]
+    turned = [np.ascontiguousarray(array @ GLTF_FROM_WORLD, np.float32) for array in (vertices, normals)]
     return turned[0], np.asarray(mesh.faces, np.int64), turned[1]
 
 

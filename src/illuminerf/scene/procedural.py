@@ -43,8 +43,8 @@ def studio_light(height: int = 64) -> EnvironmentMap:
     blank = EnvironmentMap(np.ones((height, 2 * height, 3), np.float32), "studio")
     directions = blank.directions()
     image = np.full(directions.shape, 0.32) + 0.18 * directions[..., 2:]
-    image = image + _lobe(directions, azimuth=0.5, elevation=0.7, degrees=24)[..., None] * np.array([6.0, 6.2, 6.6])
-    image = image + _lobe(directions, azimuth=-2.0, elevation=0.35, degrees=16)[..., None] * np.array([5.0, 3.9, 2.6])
+    image = image + _lobe(directions, azimuth=0.5, elevation=0.7, degrees=24.0)[..., None] * np.array([6.0, 6.2, 6.6])
+    image = image + _lobe(directions, azimuth=-2.0, elevation=0.35, degrees=16.0)[..., None] * np.array([5.0, 3.9, 2.6])
     return EnvironmentMap(np.maximum(image, 0.02).astype(np.float32), "studio")
 
 
@@ -54,8 +54,8 @@ def evening_light(height: int = 64) -> EnvironmentMap:
     directions = blank.directions()
     up = directions[..., 2:]
     sky = np.array([0.38, 0.56, 0.98]) * (0.35 + 0.65 * np.maximum(up, 0))
-    glow = _lobe(directions, azimuth=2.6, elevation=0.1, degrees=40)[..., None] * np.array([1.4, 0.65, 0.26])
-    sun = _lobe(directions, azimuth=2.6, elevation=0.42, degrees=7)[..., None] * np.array([95.0, 62.0, 32.0])
+    glow = _lobe(directions, azimuth=2.6, elevation=0.1, degrees=40.0)[..., None] * np.array([1.4, 0.65, 0.26])
+    sun = _lobe(directions, azimuth=2.6, elevation=0.42, degrees=7.0)[..., None] * np.array([95.0, 62.0, 32.0])
     ground = np.array([0.17, 0.13, 0.09])
     image = np.where(up > 0, sky, ground) + glow + sun
     return EnvironmentMap(image.astype(np.float32), "evening")

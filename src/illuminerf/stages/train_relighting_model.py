@@ -92,7 +92,9 @@ def _build(config: Config) -> RelightingModel | ControlledBase:
 class _Training:
     """One process's run."""
 
-    def __init__(self, pairs: str | Path, held_out: str | Path, config: Config, out: Path, accelerator: Accelerator) -> None:
+    def __init__(
+        self, pairs: str | Path, held_out: str | Path, config: Config, out: Path, accelerator: Accelerator
+    ) -> None:
         self.config, self.pairs, self.held_out, self.out = config, pairs, held_out, out
         self.accelerator = accelerator
         self.items: dict[int, list[TrainingItem]] = {}

@@ -1,0 +1,55 @@
+"""What a CUDA device computes is what the CPU computes. Run with `pytest -m gpu`."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from illuminerf.diffusion.sampling import sample_relit
+from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
+from illuminerf.fields.radiance_field import FieldConfig, RadianceField
+from tests.diffusion.tiny import random_condition_inputs, tiny_model, with_noise_in_every_weight
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device"),
+]
+_GRID = HashGridConfig(num_levels=4, num_features=2, log2_entries=7, coarsest=3, finest=24)
+
+
+def test_hash_grid_and_the_gradient_of_its_table() -> None:
+    grid = HashGrid(_GRID, torch.Generator().manual_seed(0)).double()
+    positions = torch.rand(500, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 1.9 - 0.95
+    outputs = []
+    for device in ("cpu", "cuda"):
+        moved = grid.to(device)
+        features, jacobian = moved.with_jacobian(positions.to(device))
+        (gradient,) = torch.autograd.grad((features**2).sum() + (jacobian**3).sum(), moved.table)
+        outputs.append([tensor.detach().cpu() for tensor in (features, jacobian, gradient)])
+    for ours, wanted in zip(outputs[1], outputs[0], strict=True):
+        torch.testing.assert_close(ours, wanted, rtol=1e-9, atol=1e-12)
+    # the guard: the next cell's features are others
+    shifted, _ = grid.with_jacobian((positions + 0.1).to("cuda"))
+    assert (shifted.detach().cpu() - outputs[0][0]).abs().max() > 1e-6
+
+
+def test_signed_distance_of_a_field() -> None:
+    config = FieldConfig.embedded()
+    config = dataclasses.replace(config, surface=dataclasses.replace(config.surface, grid=_GRID))
+    torch.manual_seed(0)
+    field = RadianceField(config)
+    positions = torch.rand(200, 3) - 0.5
+    on_cpu = field.surface.signed_distance(positions)
+    on_gpu = field.to("cuda").surface.signed_distance(positions.cuda()).cpu()
+    torch.testing.assert_close(on_gpu, on_cpu, rtol=1e-3, atol=1e-4)
+    assert on_cpu.std() > 0.01, "all the same would always agree"
+
+
+def test_samples_of_a_relighting_model() -> None:
+    model = with_noise_in_every_weight(tiny_model())
+    image, cues = random_condition_inputs(2, 32)
+    on_cpu = sample_relit(model, image, cues, [[0], [1]], 2)
+    on_gpu = sample_relit(model.to("cuda"), image.cuda(), cues.cuda(), [[0], [1]], 2).cpu()
+    torch.testing.assert_close(on_gpu, on_cpu, rtol=0, atol=0.02)
+    other = sample_relit(model, image.cuda(), cues.cuda(), [[2], [3]], 2).cpu()
+    assert (other - on_cpu).abs().max() > 0.05, "other seeds must give other samples"
