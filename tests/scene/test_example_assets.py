@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from illuminerf.cues.light_library import light_paths, load_light
+from illuminerf.cues.light_library import light_paths
 from illuminerf.cues.object_files import load_object
+from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.example_assets import write_example_assets
 
 
@@ -21,7 +22,7 @@ def test_objects_are_read_with_their_materials(tmp_path: Path) -> None:
     assert duck_colors.ndim == 2 and duck_colors.std(0).max() > 0.05, "the duck has a beak and eyes"
     board = found["board"][0][0].vertices
     assert np.ptp(board[:, 2]) < 0.2 * np.ptp(board[:, 0]), "the board lies flat in a z-up world"
-    means = [load_light(path, 16).linear_rgb.mean((0, 1)) for path in light_paths(lights)]
+    means = [EnvironmentMap.load(path).resized(16).linear_rgb.mean((0, 1)) for path in light_paths(lights)]
     assert len(means) == 4 and len({tuple(mean.round(3)) for mean in means}) == 4
 
 

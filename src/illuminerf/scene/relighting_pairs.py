@@ -24,7 +24,7 @@ from safetensors.numpy import load, save
 
 from illuminerf.scene.images import srgb_from_linear
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.shards import finished_shards, read_shard
+from illuminerf.workflow.shards import ShardIndex, finished_shards, read_shard
 from illuminerf.workflow.storage import Storage
 
 PREFIX = "pairs-"
@@ -92,7 +92,11 @@ def decode_item(content: bytes, name: str = "item") -> dict[str, np.ndarray]:
     return dense
 
 
-def iterate_items(out: str | Path) -> Iterator[tuple[str, dict[str, np.ndarray], dict[str, Any]]]:
+Item = tuple[str, dict[str, np.ndarray], dict[str, Any]]
+"""Key, dense arrays, metadata."""
+
+
+def iterate_items(out: str | Path) -> Iterator[Item]:
     """(key, dense arrays, metadata) of every item in the finished shards of a folder or fsspec URL, in order.
 
     Raises:
@@ -100,8 +104,27 @@ def iterate_items(out: str | Path) -> Iterator[tuple[str, dict[str, np.ndarray],
     """
     storage = Storage(out)
     for index in finished_shards(storage):
-        for key, files in read_shard(storage, index):
-            yield key, decode_item(files["safetensors"], key), json.loads(files["json"])
+        yield from _items(storage, index)
+
+
+def spread_items(out: str | Path, wanted: int) -> Iterator[Item]:
+    """At most `wanted` items, evenly spread; only the shards that hold them are read.
+
+    Raises:
+        UserError: one of these shards is damaged.
+    """
+    storage = Storage(out)
+    indices = finished_shards(storage)
+    keys = [key for index in indices for key in index.keys]
+    shown = {keys[i] for i in np.linspace(0, len(keys) - 1, min(wanted, len(keys))).round().astype(int)}
+    for index in indices:
+        if shown & set(index.keys):
+            yield from (item for item in _items(storage, index) if item[0] in shown)
+
+
+def _items(storage: Storage, index: ShardIndex) -> Iterator[Item]:
+    for key, files in read_shard(storage, index):
+        yield key, decode_item(files["safetensors"], key), json.loads(files["json"])
 
 
 def _half(array: np.ndarray) -> np.ndarray:

@@ -5,7 +5,6 @@ and the item with a random material composited from its cues, as training may sh
 the top, names, lights and variations above each row.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from illuminerf.diffusion.augmentation import composited_target
 from illuminerf.diffusion.training_items import training_item
 from illuminerf.scene.images import srgb_from_linear, to_uint8, write_png
-from illuminerf.scene.relighting_pairs import iterate_items
+from illuminerf.scene.relighting_pairs import spread_items
 from illuminerf.workflow.device import torch_generator
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import step_progress
@@ -65,7 +64,7 @@ def run(pairs: str | Path, config: Config, out: Path) -> Path:
     """
     rows, num_lights = [], 0
     with step_progress("preview", config.num_items) as progress:
-        for key, arrays, metadata in _spread(pairs, config.num_items):
+        for key, arrays, metadata in spread_items(pairs, config.num_items):
             num_lights = max(num_lights, len(arrays["targets"]))
             rows.append(_labelled(_row(key, arrays, config), _label(key, metadata)))
             progress.advance()
@@ -85,12 +84,6 @@ def column_starts(num_lights: int, cell: int) -> list[int]:
         starts += [x + cell * i for i in range(count)]
         x += cell * count + GAP
     return starts
-
-
-def _spread(pairs: str | Path, wanted: int) -> Iterator[tuple[str, dict[str, np.ndarray], dict[str, Any]]]:
-    total = sum(1 for _ in iterate_items(pairs))
-    shown = set(np.linspace(0, total - 1, min(wanted, total)).round().astype(int).tolist())
-    yield from (item for index, item in enumerate(iterate_items(pairs)) if index in shown)
 
 
 def _headings(num_lights: int, cell: int) -> np.ndarray:
