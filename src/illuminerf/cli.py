@@ -32,8 +32,6 @@ from illuminerf.workflow.progress import console, say
 from illuminerf.workflow.task_pool import Execution
 
 PositionalPath = Annotated[Path, tyro.conf.Positional]
-_DEFAULT_PAIRS = render_training_pairs.Config()
-_PAPER_PAIRS = render_training_pairs.Config.paper()
 _DEFAULT_PREVIEW = preview_training_pairs.Config()
 _ALL_CORES = Execution()
 
@@ -93,14 +91,20 @@ def presets_command() -> None:
         say(f"[bold]{preset.name}[/bold]: {preset.description}")
 
 
-def render_training_pairs_command(
-    objects: PositionalPath,
-    lights: PositionalPath,
-    out: str,
-    config: Annotated[render_training_pairs.Config, tyro.conf.arg(name="")] = _DEFAULT_PAIRS,
-    execution: Annotated[Execution, tyro.conf.arg(name="")] = _ALL_CORES,
-) -> None:
-    """Render objects under several lights, with cues: what a relighting model learns from.
+def _pairs_command(what: str, default: render_training_pairs.Config) -> Callable[..., None]:
+    """A subcommand that renders training pairs, with `default` as the defaults of its options."""
+
+    def command(
+        objects: PositionalPath,
+        lights: PositionalPath,
+        out: str,
+        config: Annotated[render_training_pairs.Config, tyro.conf.arg(name="")] = default,
+        execution: Annotated[Execution, tyro.conf.arg(name="")] = _ALL_CORES,
+    ) -> None:
+        render_training_pairs.run(objects, lights, config, out, execution)
+        say(f"done: {out}")
+
+    command.__doc__ = f"""{what}
 
     Args:
         objects: Folder of .glb, .gltf, .obj and .ply files, an Objaverse folder, or a list of Objaverse ids.
@@ -109,27 +113,7 @@ def render_training_pairs_command(
         config: What is rendered.
         execution: Where.
     """
-    render_training_pairs.run(objects, lights, config, out, execution)
-    say(f"done: {out}")
-
-
-def render_paper_pairs_command(
-    objects: PositionalPath,
-    lights: PositionalPath,
-    out: str,
-    config: Annotated[render_training_pairs.Config, tyro.conf.arg(name="")] = _PAPER_PAIRS,
-    execution: Annotated[Execution, tyro.conf.arg(name="")] = _ALL_CORES,
-) -> None:
-    """The same as render-training-pairs, with the paper's numbers as defaults (512 x 512, 512 samples per pixel).
-
-    Args:
-        objects: Folder of .glb, .gltf, .obj and .ply files, an Objaverse folder, or a list of Objaverse ids.
-        lights: Folder of .exr or .hdr environment maps.
-        out: Folder or fsspec URL; run the same command again to go on after an interruption.
-        config: What is rendered.
-        execution: Where.
-    """
-    render_training_pairs_command(objects, lights, out, config, execution)
+    return command
 
 
 def preview_command(
@@ -250,8 +234,14 @@ COMMANDS: dict[str, Callable[..., Any]] = {
         "Score rendered views against the truth by the TensoIR rule.",
         {"novel_views": Path, "truth": Path},
     ),
-    "render-training-pairs": render_training_pairs_command,
-    "render-paper-pairs": render_paper_pairs_command,
+    "render-training-pairs": _pairs_command(
+        "Render objects under several lights, with cues: what a relighting model learns from.",
+        render_training_pairs.Config(),
+    ),
+    "render-paper-pairs": _pairs_command(
+        "The same as render-training-pairs, with the paper's numbers as defaults (512 x 512, 512 samples per pixel).",
+        render_training_pairs.Config.paper(),
+    ),
     "train-rdm": _stage(
         train_relighting_model.run,
         train_relighting_model.Config,
