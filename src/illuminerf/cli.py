@@ -287,7 +287,8 @@ def main(arguments: list[str] | None = None) -> None:
             chosen = tyro.extras.subcommand_cli_from_dict(
                 COMMANDS,
                 prog="illuminerf",
-                description="Relight photographed objects. Also: illuminerf benchmark --help, illuminerf models --help",
+                description="Relight photographed objects. Also: "
+                + ", ".join(f"illuminerf {name} --help" for name in GROUPS),
                 args=arguments,
             )
             if isinstance(chosen, StageCall):
