@@ -271,6 +271,7 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
         "list": models.list_command,
         "info": models.info_command,
         "download": models.download_command,
+        "export": models.export_command,
     },
 }
 

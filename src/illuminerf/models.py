@@ -7,7 +7,8 @@ from rich.table import Table
 
 from illuminerf.diffusion.hub import KNOWN, KnownModel, download, models_home, repository_folder
 from illuminerf.diffusion.model_tables import layer_tables, model_on_meta, parameter_counts
-from illuminerf.diffusion.pretrained import EMBEDDED, model_folder
+from illuminerf.diffusion.pretrained import EMBEDDED, model_folder, pretrained_model
+from illuminerf.diffusion.relighting_model import RelightingModel, save_model
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import console, say
 
@@ -60,6 +61,23 @@ def download_command(name: tyro.conf.Positional[str], base: str = "", revision: 
         return
     for folder in download(name, base, revision):
         say(f"done: {folder}")
+
+
+def export_command(model: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path]) -> None:
+    """Write a trained model of the embedded kind as it is shipped: float16 weights, no training state.
+
+    Args:
+        model: What train-rdm made.
+        out: A new folder.
+    """
+    network = pretrained_model(model)
+    if not isinstance(network, RelightingModel):
+        raise UserError("only models of the embedded kind are exported so", got=f"a control on a base in {model}")
+    if out.exists() and any(out.iterdir()):
+        raise UserError(f"{out} is not empty", fix="choose a new folder")
+    save_model(network, out, half=True)
+    size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    say(f"done: {out}, {size / 1e6:.1f} MB")
 
 
 def _places(model: KnownModel) -> tuple[list[Path], list[Path]]:

@@ -10,7 +10,10 @@ import pytest
 from illuminerf.cli import main
 from illuminerf.diffusion import hub
 from illuminerf.diffusion.hub import DILIGHTNET_CONTROL, KNOWN, SD21, download, find_base, repository_folder
+from illuminerf.diffusion.pretrained import pretrained_model
+from illuminerf.diffusion.relighting_model import save_model
 from illuminerf.workflow.errors import UserError
+from tests.diffusion.tiny import tiny_model, with_noise_in_every_weight
 
 
 class StandInHub:
@@ -109,3 +112,18 @@ def test_bases_are_folders_or_ids(tmp_path: Path, served: StandInHub) -> None:
         find_base("a/b")
     with pytest.raises(UserError, match="unknown model"):
         download("huge")
+
+
+def test_export_writes_what_ships(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trained = with_noise_in_every_weight(tiny_model())
+    save_model(trained, tmp_path / "trained")
+    main(["models", "export", str(tmp_path / "trained"), str(tmp_path / "shipped")])
+    shipped = pretrained_model(tmp_path / "shipped")
+    weights = trained.state_dict()
+    assert all(
+        torch.allclose(value, weights[name], rtol=1e-3, atol=1e-6) for name, value in shipped.state_dict().items()
+    )
+    sizes = [sum(path.stat().st_size for path in (tmp_path / f).rglob("*.safetensors")) for f in ("trained", "shipped")]
+    assert sizes[1] < 0.7 * sizes[0]
+    with pytest.raises(SystemExit):
+        main(["models", "export", str(tmp_path / "trained"), str(tmp_path / "shipped")])
