@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from illuminerf.cli import main
 from illuminerf.diffusion import hub
