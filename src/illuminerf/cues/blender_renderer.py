@@ -70,8 +70,8 @@ class BlenderItemRenderer:
     denoises: bool = False
     """Let OpenImageDenoise work on every picture; it harms sharp reflections."""
     timeout_seconds: float = 1500.0
-    """After which an item is given up. Where ILLUMINERF_TASK_SECONDS says how long a task may take, at most 0.8 of that,
-    so that Blender is ended by its own renderer and not left behind by whatever ends that."""
+    """After which an item is given up; at most 0.8 of what ILLUMINERF_TASK_SECONDS, where it is set, allows a task, so
+    that Blender is ended here before the task is."""
     bakes_properties: bool = True
     """Read base colour, roughness and metallic from textures moved onto vertices, as Mitsuba's renderings are by
     default; the pictures themselves keep their textures."""
