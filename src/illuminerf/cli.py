@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import tyro
+from rich.markup import escape
 
 from illuminerf import benchmark, demo, models, pipeline
 from illuminerf.data.objaverse_download import download_objaverse
@@ -28,7 +29,7 @@ from illuminerf.stages import (
     train_relighting_model,
 )
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import console, say
+from illuminerf.workflow.progress import say
 from illuminerf.workflow.task_pool import Execution
 
 PositionalPath = Annotated[Path, tyro.conf.Positional]
@@ -88,7 +89,7 @@ def demo_command(out: Path = Path("runs/demo"), device: str = "auto", seed: int 
 def presets_command() -> None:
     """List the presets: what each is for and what it costs."""
     for preset in PRESETS.values():
-        say(f"[bold]{preset.name}[/bold]: {preset.description}")
+        say(f"[bold]{escape(preset.name)}[/bold]: {escape(preset.description)}", markup=True)
 
 
 def _pairs_command(what: str, default: render_training_pairs.Config) -> Callable[..., None]:
@@ -279,7 +280,7 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: exit status 0, 2 for what the user can mend, 130 for Ctrl-C."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    warnings.showwarning = lambda message, *_: say(f"[yellow]warning:[/yellow] {message}")
+    warnings.showwarning = lambda message, *_: say(f"[yellow]warning:[/yellow] {escape(str(message))}", markup=True)
     try:
         if arguments[:1] and arguments[0] in GROUPS:
             group = arguments[0]
@@ -295,7 +296,7 @@ def main(arguments: list[str] | None = None) -> None:
             if isinstance(chosen, StageCall):
                 chosen.execute()
     except UserError as error:
-        console.print(f"[bold red]error:[/bold red] {error}", highlight=False, markup=True)
+        say(f"[bold red]error:[/bold red] {escape(str(error))}", markup=True)
         sys.exit(2)
     except KeyboardInterrupt:
         say("stopped; run the same command again to go on")

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
 from illuminerf.diffusion.hub import KNOWN, KnownModel, download, models_home, repository_folder
@@ -21,7 +22,7 @@ def list_command() -> None:
     for model in KNOWN.values():
         folders, missing = _places(model)
         where = "yes" if not missing else f"{len(missing)} files missing"
-        table.add_row(model.name, model.purpose, model.size, where, ", ".join(map(str, folders)))
+        table.add_row(model.name, model.purpose, model.size, where, escape(", ".join(map(str, folders))))
     console.print(table)
 
 
@@ -32,7 +33,7 @@ def info_command(name: tyro.conf.Positional[str]) -> None:
         name: embedded, dilightnet or paper.
     """
     model = model_on_meta(name)
-    say(f"[bold]{name}[/bold]: {KNOWN[name].purpose}; licence: {KNOWN[name].licence}")
+    say(f"[bold]{name}[/bold]: {escape(KNOWN[name].purpose)}; licence: {escape(KNOWN[name].licence)}", markup=True)
     counts = Table(title="Parameters")
     counts.add_column("module")
     counts.add_column("parameters", justify="right")

@@ -3,9 +3,12 @@
 Blender is found through ILLUMINERF_BLENDER (a blender program, or a Python that has bpy) or as bpy of this Python.
 """
 
+import errno
 import importlib.util
 import json
 import os
+import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -16,7 +19,7 @@ import pytest
 
 from illuminerf.cues import blender_renderer
 from illuminerf.cues.blender_job import Rendering, read_rendering, write_job
-from illuminerf.cues.blender_renderer import BlenderItemRenderer, worker_command
+from illuminerf.cues.blender_renderer import BlenderFailed, BlenderItemRenderer, capped_timeout, worker_command
 from illuminerf.cues.item_renderer import MitsubaItemRenderer, RenderedItem
 from illuminerf.cues.materials import Material, Parts
 from illuminerf.cues.renderer import CUE_NAMES, CueSampling
@@ -213,6 +216,92 @@ time.sleep(60)
     while _is_running(int(pid_file.read_text())) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not _is_running(int(pid_file.read_text()))
+
+
+def test_blender_ends_with_a_killed_parent(tmp_path: Path) -> None:
+    """The parent is killed and cannot end its child; without the watch the child would stay."""
+    body = """
+import os, runpy, time, types
+for name in ("bpy", "mathutils"):
+    sys.modules[name] = types.ModuleType(name)
+sys.modules["bpy"].app, sys.modules["mathutils"].Matrix = types.SimpleNamespace(version=(4, 2)), None
+worker = runpy.run_path({worker!r})
+if {watches}:
+    worker["end_with_parent"]()
+Path({pid_file!r}).write_text(str(os.getpid()))
+time.sleep(60)
+"""
+    caller = "import sys; from pathlib import Path; from illuminerf.cues.blender_renderer import run_blender; "
+    caller += "run_blender([sys.argv[1], sys.argv[2]], Path(sys.argv[2]) / 'log.txt', 60)"
+    for watches in (True, False):
+        pid_file = tmp_path / f"pid_{watches}"
+        text = body.format(worker=str(blender_renderer._WORKER), watches=watches, pid_file=str(pid_file))
+        parent = subprocess.Popen([sys.executable, "-c", caller, program(tmp_path, text), str(tmp_path)])
+        _wait_until(lambda file=pid_file: file.exists() and bool(file.read_text()), 30)  # type: ignore[misc]
+        child = int(pid_file.read_text())
+        parent.kill()
+        parent.wait()
+        ended = _wait_until(lambda pid=child: not _is_running(pid), 10 if watches else 2)  # type: ignore[misc]
+        assert ended == watches
+        if not ended:
+            os.kill(child, signal.SIGKILL)
+
+
+def _wait_until(condition: Callable[[], bool], seconds: float) -> bool:
+    deadline = time.monotonic() + seconds
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return condition()
+
+
+@pytest.mark.parametrize(
+    ("said", "fix"),
+    [
+        ("OSError: [Errno 28] No space left on device: 'a.exr'", "TMPDIR"),
+        ("Error writing file: No space left on device", "TMPDIR"),
+        ("CUDA error: Out of memory in cuMemAlloc", "graphics card"),
+        ("Failed to create OptiX context", "graphics card"),
+        ("System is out of GPU memory", "graphics card"),
+        ("Cycles finds no CUDA device on this machine", "graphics card"),
+        ("Malloc returns null: len=123", "fewer workers"),
+        ("MemoryError", "fewer workers"),
+    ],
+)
+@pytest.mark.parametrize("status", [0, 1])
+def test_shortages_of_the_machine_are_no_fault_of_the_item(tmp_path: Path, said: str, fix: str, status: int) -> None:
+    body = f"print({said!r})\nfor i in range(20): print('Saved', i)\nsys.exit({status})"
+    with pytest.raises(UserError, match=fix) as caught:
+        BlenderItemRenderer(1, FEW, program(tmp_path, body)).render([(sphere_mesh(1), Material())], SMALL, [WHITE], 0)
+    assert not isinstance(caught.value, BlenderFailed)
+
+
+def test_a_killed_blender_is_no_fault_of_the_item_but_a_crashed_one_is(tmp_path: Path) -> None:
+    for number, kind in ((signal.SIGKILL, UserError), (signal.SIGSEGV, BlenderFailed)):
+        executable = program(tmp_path, f"import os; os.kill(os.getpid(), {int(number)})")
+        with pytest.raises(UserError) as caught:
+            BlenderItemRenderer(1, FEW, executable).render([(sphere_mesh(1), Material())], SMALL, [WHITE], 0)
+        assert type(caught.value) is kind
+
+
+def test_a_job_that_cannot_be_written_is_no_fault_of_the_item(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(blender_renderer, "write_job", full)
+    with pytest.raises(UserError, match="cannot be written; got .*No space left.*Fix: free") as caught:
+        BlenderItemRenderer(1, FEW, program(tmp_path, "")).render([(sphere_mesh(1), Material())], SMALL, [WHITE], 0)
+    assert not isinstance(caught.value, BlenderFailed)
+
+
+def test_the_limit_of_a_task_caps_the_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ILLUMINERF_TASK_SECONDS", raising=False)
+    assert capped_timeout(BlenderItemRenderer().timeout_seconds) == 1500
+    monkeypatch.setenv("ILLUMINERF_TASK_SECONDS", "600")
+    assert capped_timeout(1500.0) == pytest.approx(480) and capped_timeout(30.0) == 30
+    for wrong in ("soon", "0", "nan"):
+        monkeypatch.setenv("ILLUMINERF_TASK_SECONDS", wrong)
+        with pytest.raises(UserError, match="ILLUMINERF_TASK_SECONDS"):
+            capped_timeout(1500.0)
 
 
 def _is_running(pid: int) -> bool:

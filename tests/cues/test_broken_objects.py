@@ -1,7 +1,10 @@
 """Every kind of broken object is refused with its reason, quickly and without much memory."""
 
+import errno
 import io
 import json
+import os
+import pickle
 import struct
 import tracemalloc
 import zlib
@@ -13,6 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from illuminerf.cues import object_files
 from illuminerf.cues.broken_object import BrokenObject
 from illuminerf.cues.object_files import ObjectReading, load_object
 from illuminerf.cues.raw_objects import ReadingLimits
@@ -189,7 +193,147 @@ def test_cut_files_and_noise_are_unreadable(tmp_path: Path) -> None:
         assert reason(tmp_path / name)[0] == "unreadable"
     (tmp_path / "a.fbx").write_bytes(whole)
     assert reason(tmp_path / "a.fbx")[0] == "unreadable"
-    assert reason(tmp_path / "absent.glb")[0] == "unreadable"
+
+
+def machine_trouble(path: Path) -> str:
+    """The error of a file that cannot be read, which says nothing about the object."""
+    with pytest.raises(UserError) as caught:
+        load_object(path, np.random.default_rng(0))
+    assert not isinstance(caught.value, BrokenObject) and caught.value.got and caught.value.fix
+    return str(caught.value)
+
+
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nmtllib a.mtl\nusemtl stuff\nf 1/1 2/2 3/3\n"
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf", ".obj", ".ply"])
+@pytest.mark.parametrize("code", [errno.EIO, errno.ESTALE, errno.EACCES])
+def test_a_disk_that_fails_is_no_fault_of_the_object(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, code: int
+) -> None:
+    path = tmp_path / f"a{suffix}"
+    assert "a" + suffix in machine_trouble(path)  # absent
+    (tmp_path / "a.mtl").write_text("newmtl stuff\nKd 1 0 0\n")
+    whole = {".obj": OBJ.encode(), ".ply": PLY.encode()}.get(suffix) or Gltf().mesh().glb(tmp_path / "b").read_bytes()
+    path.write_bytes(whole)
+    assert is_kept(path)
+
+    opened = io.open
+
+    def failing(file: Any, *arguments: Any, **options: Any) -> Any:
+        if str(file) == str(path):
+            raise OSError(code, os.strerror(code), str(path))
+        return opened(file, *arguments, **options)
+
+    monkeypatch.setattr(io, "open", failing)
+    monkeypatch.setattr("builtins.open", failing)
+    assert os.strerror(code) in machine_trouble(path)
+
+
+def test_side_files_that_fail_are_no_fault_but_missing_ones_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.obj").write_text(OBJ)
+    assert reason(tmp_path / "a.obj")[0] == "missing texture"
+    (tmp_path / "a.obj").write_text(OBJ.replace("a.mtl", "m" * 5000))
+    assert reason(tmp_path / "a.obj")[0] == "unreadable"
+    (tmp_path / "a.obj").write_text(OBJ)
+    (tmp_path / "a.mtl").write_text("newmtl stuff\nmap_Kd a.png\n")
+    assert reason(tmp_path / "a.obj")[0] == "missing texture"
+    (tmp_path / "a.png").write_bytes(png((1, 2, 3)))
+    assert is_kept(tmp_path / "a.obj")
+    read = Path.read_bytes
+
+    def failing(path: Path) -> bytes:
+        if path.name == "a.png":
+            raise OSError(errno.EIO, "Input/output error")
+        return read(path)
+
+    monkeypatch.setattr(Path, "read_bytes", failing)
+    assert "Input/output" in machine_trouble(tmp_path / "a.obj")
+
+
+def test_too_little_memory_is_no_fault_of_the_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def too_much(*_: Any) -> None:
+        raise MemoryError
+
+    path = Gltf().mesh().glb(tmp_path / "a.glb")
+    for name in ("read_gltf", "normalized"):
+        with monkeypatch.context() as patched:
+            patched.setattr(object_files, name, too_much)
+            with pytest.raises(MemoryError):
+                load_object(path, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    "line", ["Pr nan", "Pm inf", "d nan", "Kd nan 0 0", "illum nan", "Tr -inf", "map_Bump -bm nan n.png", "Pr rough"]
+)
+def test_numbers_of_materials_must_be_finite(tmp_path: Path, line: str) -> None:
+    (tmp_path / "a.obj").write_text(OBJ)
+    (tmp_path / "n.png").write_bytes(png((128, 128, 255)))
+    (tmp_path / "a.mtl").write_text(f"newmtl stuff\nKd 0.5 0.5 0.5\n{line}\n")
+    with pytest.raises(BrokenObject, match=r"a\.mtl has a broken material 'stuff'") as caught:
+        load_object(tmp_path / "a.obj", np.random.default_rng(0))
+    assert caught.value.reason == "unreadable"
+    finite = line.replace("nan", "1").replace("-inf", "0").replace("inf", "1").replace("rough", "0.5")
+    (tmp_path / "a.mtl").write_text(f"newmtl stuff\nKd 0.5 0.5 0.5\n{finite}\n")
+    assert is_kept(tmp_path / "a.obj")
+
+
+def test_numbers_of_gltf_that_are_not_finite_count_as_left_out(tmp_path: Path) -> None:
+    gltf = Gltf()
+    normal = gltf.texture(png((160, 128, 220))) | {"scale": float("nan")}
+    pbr = {"baseColorFactor": [float("nan"), 0.5, 0.5, float("nan")], "roughnessFactor": float("inf")}
+    gltf.mesh(material={"pbrMetallicRoughness": pbr, "normalTexture": normal}, TEXCOORD_0=UV)
+    ((_, material),) = load_object(gltf.glb(tmp_path / "a.glb"), np.random.default_rng(0))
+    assert material.normal_map is not None and np.isfinite(material.normal_map).all()
+    assert np.asarray(material.base_color)[0, 0].tolist() == [1.0, 0.5, 0.5] and np.max(material.roughness) == 1
+
+
+@pytest.mark.parametrize(
+    "error", [UserError("a material's roughness is out of range"), ValueError("x"), ZeroDivisionError(), IndexError(),
+              struct.error("x"), BrokenObject("too large", "a.glb is too large")]
+)  # fmt: skip
+@pytest.mark.parametrize("step", ["normalized", "merged_by_material", "_finished"])
+def test_trouble_after_reading_leaves_the_object_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, step: str
+) -> None:
+    def fails(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(object_files, step, fails)
+    found, _ = reason(Gltf().mesh().glb(tmp_path / "a.glb"))
+    assert found == ("too large" if isinstance(error, BrokenObject) else "unreadable")
+
+
+def test_errors_survive_a_process_pool() -> None:
+    error = BrokenObject("missing texture", "a.glb names a file", got="'x.png'", wanted="a file", fix="copy it")
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is BrokenObject and str(again) == str(error)
+    assert (again.reason, again.what, again.got, again.wanted, again.fix) == (
+        "missing texture", "a.glb names a file", "'x.png'", "a file", "copy it",
+    )  # fmt: skip
+
+
+def test_bump_maps_are_decoded_like_other_textures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """PostScript, which Pillow would have another program run, is never opened; a bluish picture is."""
+    (tmp_path / "a.obj").write_text(OBJ)
+    (tmp_path / "a.mtl").write_text("newmtl stuff\nmap_Kd a.png\nmap_Bump b.png\n")
+    (tmp_path / "a.png").write_bytes(png((1, 2, 3)))
+    (tmp_path / "b.png").write_bytes(png((128, 128, 255)))
+    ((_, material),) = load_object(tmp_path / "a.obj", np.random.default_rng(0))
+    assert material.normal_map is not None
+    postscript = io.BytesIO()
+    Image.new("RGB", (4, 4), (128, 128, 255)).save(postscript, "EPS")
+    (tmp_path / "b.png").write_bytes(postscript.getvalue())
+    monkeypatch.setattr("PIL.EpsImagePlugin.Ghostscript", lambda *_, **__: pytest.fail("Ghostscript was started"))
+    assert Image.open(io.BytesIO(postscript.getvalue())).format == "EPS"
+    ((_, material),) = load_object(tmp_path / "a.obj", np.random.default_rng(0))
+    assert material.normal_map is None
 
 
 def test_damaged_bytes_never_escape_as_other_errors(tmp_path: Path) -> None:

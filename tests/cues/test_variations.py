@@ -100,5 +100,5 @@ def test_objects_stand_side_by_side_on_one_ground() -> None:
 
 
 def test_wrong_probabilities_are_explained() -> None:
-    with pytest.raises(UserError, match="probabilities"):
+    with pytest.raises(UserError, match="got 0.5, 1.5, 0.15; wanted values in"):
         MaterialVariation(swap_probability=1.5)

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save
@@ -17,7 +18,7 @@ from illuminerf.diffusion.cue_coding import decode_cues
 from illuminerf.diffusion.materials import composited
 from illuminerf.diffusion.objective import Batch
 from illuminerf.diffusion.relighting_scores import held_out_pairs, masked_psnr, masked_ssim, rescaled
-from illuminerf.diffusion.training_items import diffuse_level, load_items
+from illuminerf.diffusion.training_items import diffuse_level, load_items, training_item
 from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
 from illuminerf.scene.relighting_pairs import iterate_items
 from illuminerf.workflow.errors import UserError
@@ -84,6 +85,45 @@ def test_items_are_straight_and_averaged_exactly(folder: Path) -> None:
     torch.testing.assert_close((item.targets * item.alpha).float(), targets, atol=2e-3, rtol=0)
     energy = torch.nn.functional.avg_pool2d(targets, 2)
     torch.testing.assert_close((small.targets * small.alpha).float(), energy, atol=3e-3, rtol=0)
+
+
+def test_edges_keep_their_materials_when_averaged_down() -> None:
+    """Blocks of which half is covered, and by halves: straight values stay what they are on the object."""
+    alpha = np.zeros((8, 8), np.uint8)
+    alpha[:, 1::2] = 128
+    alpha[:, 3::4] = 255
+    coded = round(255 * float(srgb_from_linear(torch.tensor(0.5))))
+    arrays = {
+        "targets": np.zeros((1, 3, 8, 8), np.float16),
+        "cues": np.zeros((1, 12, 8, 8), np.float16),
+        "alpha": alpha,
+        "albedo": np.where(alpha > 0, coded, 0).astype(np.uint8)[None].repeat(3, 0),
+        "roughness": np.where(alpha > 0, 102, 0).astype(np.uint8),
+        "metallic": np.where(alpha > 0, 255, 0).astype(np.uint8),
+    }
+    for size in (8, 4, 2):
+        item = training_item("a", arrays, size)
+        is_covered = item.alpha[0] > 0
+        for values, wanted in ((item.albedo, 0.5), (item.roughness, 0.4), (item.metallic, 1.0)):
+            torch.testing.assert_close(
+                values[:, is_covered].float(), torch.full_like(values[:, is_covered].float(), wanted), atol=3e-3, rtol=0
+            )
+    # a plain mean in sRGB makes the edge a fifth as bright
+    plain = torch.nn.functional.avg_pool2d(torch.from_numpy(arrays["albedo"]).float() / 255, 2)
+    assert float((linear_from_srgb(plain) - 0.5).abs().min()) > 0.3
+
+
+def test_albedo_is_averaged_as_light() -> None:
+    """Black and white, half each, reflect half the light; the mean in sRGB reflects a fifth."""
+    checks = (np.indices((4, 4)).sum(0) % 2 * 255).astype(np.uint8)
+    arrays = {
+        "targets": np.zeros((1, 3, 4, 4), np.float16), "cues": np.zeros((1, 12, 4, 4), np.float16),
+        "alpha": np.full((4, 4), 255, np.uint8), "albedo": checks[None].repeat(3, 0), "roughness": checks,
+        "metallic": checks,
+    }  # fmt: skip
+    item = training_item("a", arrays, 2)
+    assert bool((item.albedo == 0.5).all()) and bool(((item.roughness - 0.5).abs() < 1e-3).all())
+    assert float(linear_from_srgb(torch.tensor(0.5))) < 0.25
 
 
 def test_plain_examples_are_exposed_alike(folder: Path) -> None:

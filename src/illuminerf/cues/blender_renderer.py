@@ -7,6 +7,7 @@ or another Python may do the work instead. docs/renderers.md says how to install
 import contextlib
 import importlib.util
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -35,6 +36,19 @@ _INSTALL = (
 )
 _SYSTEM_LIBRARIES = "apt install libxxf86vm1 libxfixes3 libxi6 libxkbcommon0 libxrender1 libsm6 libgl1 libgomp1"
 _LAST_LINES = 8
+_FREE_SPACE = "free some space where temporary files lie, or name a folder with more in TMPDIR"
+_LESS_AT_ONCE = "run fewer workers at once, or on a machine with more memory"
+_OTHER_DEVICE = "see that the graphics card works and is free, or render with --device cpu"
+# What Blender says where the machine is short of something, in lower case, and what to do: no fault of the item.
+_SHORTAGES = (
+    (r"errno 28\b|no space left|disk full|errno 122\b|disk quota", _FREE_SPACE),
+    (r"out of gpu memory|(cuda|optix|hip)[ _]?error|(cuda|optix)_error|failed to create (cuda|optix)|cuda device"
+     r"|failed to (load|build) (cuda|optix) kernel|illegal address", _OTHER_DEVICE),
+    (r"out of memory|cannot allocate memory|errno 12\b|memoryerror|bad_alloc|calloc returns null|malloc returns null",
+     _LESS_AT_ONCE),
+)  # fmt: skip
+_TASK_SECONDS = "ILLUMINERF_TASK_SECONDS"
+_SHARE_OF_TASK = 0.8
 
 
 class BlenderFailed(UserError):
@@ -55,8 +69,9 @@ class BlenderItemRenderer:
     Python, else the blender on the PATH."""
     denoises: bool = False
     """Let OpenImageDenoise work on every picture; it harms sharp reflections."""
-    timeout_seconds: float = 7200.0
-    """After which an item is given up."""
+    timeout_seconds: float = 1500.0
+    """After which an item is given up; at most 0.8 of what ILLUMINERF_TASK_SECONDS, where it is set, allows a task, so
+    that Blender is ended here before the task is."""
     bakes_properties: bool = True
     """Read base colour, roughness and metallic from textures moved onto vertices, as Mitsuba's renderings are by
     default; the pictures themselves keep their textures."""
@@ -71,14 +86,19 @@ class BlenderItemRenderer:
         """Render what the first view of `camera` sees of `parts`, once per light.
 
         Raises:
-            UserError: there is no Blender, or it failed or ran out of time; the message has its last lines.
+            BlenderFailed: it failed or ran out of time; the message has its last lines.
+            UserError: there is no Blender, or this machine is short of something that it needs.
         """
         renderings = self._renderings(len(lights), seed)
         device = self.cue_sampling.device
         with tempfile.TemporaryDirectory(prefix="illuminerf-blender-") as name:
             folder = Path(name)
-            write_job(folder, parts, camera, lights, renderings, self.denoises, device)
-            run_blender(worker_command(self.executable, folder), folder / "log.txt", self.timeout_seconds)
+            try:
+                write_job(folder, parts, camera, lights, renderings, self.denoises, device)
+            except OSError as error:
+                raise UserError("Blender's job cannot be written", got=str(error), fix=_FREE_SPACE) from error
+            timeout = capped_timeout(self.timeout_seconds)
+            run_blender(worker_command(self.executable, folder), folder / "log.txt", timeout)
             images = {r.name: _picture(folder, r.name, camera) for r in renderings}
         planes = {key: image.transpose(2, 0, 1) for key, image in images.items()}
         targets = [planes[f"target_{i}"][:3] for i in range(len(lights))]
@@ -129,17 +149,35 @@ def worker_command(executable: str, folder: Path) -> list[str]:
     return [found, *options, "--", str(folder)]
 
 
+def capped_timeout(seconds: float) -> float:
+    """`seconds`, or 0.8 of what ILLUMINERF_TASK_SECONDS allows, whichever is less."""
+    text = os.environ.get(_TASK_SECONDS, "").strip()
+    if not text:
+        return seconds
+    try:
+        allowed = float(text)
+    except ValueError:
+        allowed = float("nan")
+    if not allowed > 0:
+        raise UserError(f"{_TASK_SECONDS} is no number of seconds", got=text, wanted="a number above 0")
+    return min(seconds, _SHARE_OF_TASK * allowed)
+
+
 def run_blender(command: list[str], log_file: Path, timeout_seconds: float) -> None:
     """Run a command to its end, what it says in a file: the blender program complains on stdout, bpy on stderr.
 
     Raises:
-        UserError: it does not start, fails or runs out of time.
+        BlenderFailed: it fails or runs out of time.
+        UserError: it does not start, or this machine is short of something that it needs.
     """
+    # the worker ends itself when this process is gone, even where it was killed and could not end the worker
+    environment = {**os.environ, "ILLUMINERF_PARENT": str(os.getpid())}
     try:
         with log_file.open("wb") as log:
             process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
-            )
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
+                env=environment,
+            )  # fmt: skip
     except OSError as error:
         raise UserError("Blender does not start", got=str(error), fix=_INSTALL) from error
     try:
@@ -157,20 +195,36 @@ def run_blender(command: list[str], log_file: Path, timeout_seconds: float) -> N
             process.wait()
     if status != 0:
         words = _last_lines(log_file)
-        fix = ""
-        if "No module named 'bpy'" in words:
-            fix = _INSTALL
-        elif "No module named 'numpy'" in words:
-            fix = "install numpy for Blender's own Python (Debian, Ubuntu: apt install python3-numpy)"
-        elif ".so" in words and ("cannot open shared object" in words or "shared libraries" in words):
-            fix = f"install the system libraries that Blender needs (Debian, Ubuntu: {_SYSTEM_LIBRARIES})"
+        fix = _mendable(words) or _shortage(log_file)
+        if status == -signal.SIGKILL:  # nobody here sent it: as a rule the system, out of memory
+            fix = fix or _LESS_AT_ONCE
         kind = UserError if fix else BlenderFailed
         raise kind(f"Blender failed with status {status}", got=words, fix=fix)
 
 
+def _mendable(words: str) -> str:
+    """What to install where Blender lacks a part of itself, else ""."""
+    if "No module named 'bpy'" in words:
+        return _INSTALL
+    if "No module named 'numpy'" in words:
+        return "install numpy for Blender's own Python (Debian, Ubuntu: apt install python3-numpy)"
+    if ".so" in words and ("cannot open shared object" in words or "shared libraries" in words):
+        return f"install the system libraries that Blender needs (Debian, Ubuntu: {_SYSTEM_LIBRARIES})"
+    return ""
+
+
+def _shortage(log_file: Path) -> str:
+    """What to do where the log tells of a full disk, too little memory or a broken graphics card, else ""."""
+    text = log_file.read_text(errors="replace").lower()
+    return next((fix for pattern, fix in _SHORTAGES if re.search(pattern, text)), "")
+
+
 def _picture(folder: Path, name: str, camera: Cameras) -> np.ndarray:
     if not (folder / f"{name}.exr").is_file():  # Blender may leave with status 0 all the same
-        raise BlenderFailed(f"Blender ended without the picture {name}", got=_last_lines(folder / "log.txt"))
+        log_file = folder / "log.txt"
+        fix = _shortage(log_file)
+        kind = UserError if fix else BlenderFailed
+        raise kind(f"Blender ended without the picture {name}", got=_last_lines(log_file), fix=fix)
     return read_rendering(folder, name, camera)
 
 

@@ -10,6 +10,8 @@ know only their names, and of Python only numpy. Blender 3.4 to 5.3 are known to
 import json
 import os
 import sys
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ import numpy as np
 from mathutils import Matrix
 
 _SENSOR_MILLIMETRES = 36.0
+_PARENT = "ILLUMINERF_PARENT"
 _LINEAR, _RAW = "Linear Rec.709" if bpy.app.version >= (4, 0) else "Linear", "Non-Color"
 
 
@@ -276,5 +279,37 @@ def cleared(owner: Any) -> Any:
     return owner.node_tree
 
 
+def end_with_parent() -> None:
+    """Leave as soon as the process that wanted the pictures (ILLUMINERF_PARENT) is gone, even if it was killed.
+
+    A thread watches, since the kernel's own signal comes when the thread that started this process ends. A wrapper
+    may stand between the two processes, or a container hide one from the other; then only its own parent counts.
+    """
+    named = os.environ.get(_PARENT, "")
+    if os.name != "posix" or not named.isdigit():
+        return
+    wanted, first = int(named), os.getppid()
+    is_seen = is_running(wanted)
+
+    def watch() -> None:
+        while os.getppid() == first and (not is_seen or is_running(wanted)):
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def is_running(process: int) -> bool:
+    """Whether there is a process of this number."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
 if __name__ == "__main__":
+    end_with_parent()
     main(Path(sys.argv[-1]))

@@ -1,5 +1,6 @@
 """Why an object cannot be used, in words that can be counted."""
 
+from collections.abc import Callable
 from typing import Literal
 
 from illuminerf.workflow.errors import UserError
@@ -32,3 +33,11 @@ class BrokenObject(UserError):
     def __init__(self, reason: BrokenReason, what: str, *, got: str = "", wanted: str = "", fix: str = "") -> None:
         super().__init__(what, got=got, wanted=wanted, fix=fix)
         self.reason: BrokenReason = reason
+
+    def __reduce__(self) -> tuple[Callable[..., "BrokenObject"], tuple[str, ...]]:
+        # a process pool hands errors over in pickles, which by themselves would be made again of the message alone
+        return _made_again, (self.reason, self.what, self.got, self.wanted, self.fix)
+
+
+def _made_again(reason: BrokenReason, what: str, got: str, wanted: str, fix: str) -> BrokenObject:
+    return BrokenObject(reason, what, got=got, wanted=wanted, fix=fix)

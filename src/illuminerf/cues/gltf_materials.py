@@ -75,7 +75,7 @@ class GltfMaterials:
             name: self._image(info) for name, info in infos.items() if info and self._coordinates(info) == coordinates
         }
         factor = (old or {}).get("diffuseFactor") if old is not None else pbr.get("baseColorFactor")
-        alpha = 1.0 if factor is None or len(factor) < 4 else float(factor[3])
+        alpha = 1.0 if factor is None or len(factor) < 4 else _finite(factor[3], 1.0)
         material = RawMaterial(
             color=None if factor is None else _clipped_color(factor),
             color_image=images.get("color"),
@@ -83,7 +83,7 @@ class GltfMaterials:
             alpha_cutoff=_alpha_cutoff(entry),
             transmits=_transmits(extensions),
             normal_image=images.get("normal"),
-            normal_scale=float((entry.get("normalTexture") or {}).get("scale", 1.0)),
+            normal_scale=_finite((entry.get("normalTexture") or {}).get("scale", 1.0), 1.0),
             wraps=all(self._wraps(info) for info in infos.values() if info),
         )
         if old is not None:
@@ -149,7 +149,7 @@ def _alpha_cutoff(entry: dict[str, Any]) -> float | None:
         case "BLEND":
             return None
         case "MASK":
-            return float(entry.get("alphaCutoff", 0.5))
+            return _finite(entry.get("alphaCutoff", 0.5), 0.5)
         case _:
             return -1.0
 
@@ -163,9 +163,13 @@ def _transmits(extensions: dict[str, Any]) -> bool:
     )
 
 
-def _unit(value: Any) -> float:
+def _finite(value: Any, default: float) -> float:
     number = float(value)
-    return float(np.clip(number, 0, 1)) if np.isfinite(number) else 1.0
+    return number if np.isfinite(number) else default
+
+
+def _unit(value: Any) -> float:
+    return float(np.clip(_finite(value, 1.0), 0, 1))
 
 
 def _clipped_color(factor: Any) -> tuple[float, float, float]:

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from illuminerf.cues.mitsuba_variant import load_mitsuba
+from illuminerf.cues.mitsuba_wavefront import rendered_pixels
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.workflow.device import derived_seed
@@ -12,6 +13,9 @@ from illuminerf.workflow.errors import UserError
 
 # Mitsuba keeps all samples of a pass in memory; 2^21 of them need about 1 GB.
 _SAMPLES_PER_PASS = 2**21
+# Pixels of a side of what one thread of scalar_rgb renders. Left to itself Mitsuba makes as many blocks as there are
+# threads, and each block has its own random numbers.
+_BLOCK_SIDE = 32
 # Our equirectangular axes in Mitsuba's own frame for environment maps (docs/conventions.md).
 _WORLD_FROM_ENVMAP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
 _OPENGL_FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
@@ -104,7 +108,7 @@ class MitsubaScene:
     def _integrator(self, kind: str, options: dict[str, Any]) -> Any:
         key = (kind, *sorted(options.items()))
         if key not in self._integrators:
-            self._integrators[key] = self.mitsuba.load_dict({"type": kind, **options})
+            self._integrators[key] = self.mitsuba.load_dict({"type": kind, "block_size": _BLOCK_SIDE, **options})
         return self._integrators[key]
 
     def render(self, cameras: Cameras, view: int, max_depth: int, samples_per_pixel: int, seed: int) -> np.ndarray:
@@ -126,14 +130,19 @@ class MitsubaScene:
         total, counted = np.zeros(0, np.float32), 0
         for index in range(num_passes):
             spp = samples_per_pixel // num_passes + (index < samples_per_pixel % num_passes)
-            image = self.mitsuba.render(
-                self.scene, sensor=sensor, integrator=integrator, seed=derived_seed(seed, index) % 2**32, spp=spp
-            )
-            # a path of zero probability can give a NaN in single precision; it carries no light
-            values = np.nan_to_num(np.array(image, np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-            total, counted = (spp * values if index == 0 else total + spp * values), counted + spp
+            values, drawn = self._one_pass(sensor, integrator, derived_seed(seed, index) % 2**32, spp)
+            total, counted = (drawn * values if index == 0 else total + drawn * values), counted + drawn
         image = total / np.float32(counted)
         return image if square.height == cameras.height else _rows_resampled(image, cameras, view)
+
+    def _one_pass(self, sensor: Any, integrator: Any, seed: int, spp: int) -> tuple[np.ndarray, int]:
+        """The same bytes with any number of threads, and the samples per pixel, which the sampler may round up."""
+        if not self.mitsuba.variant().startswith("scalar"):
+            return rendered_pixels(self.mitsuba, self.scene, sensor, integrator, seed, spp)
+        image = self.mitsuba.render(self.scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
+        # a path of zero probability can give a NaN in single precision; it carries no light
+        values = np.nan_to_num(np.array(image, np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+        return values, int(sensor.sampler().sample_count())
 
 
 def _rows_from_pole_to_pole(linear_rgb: np.ndarray) -> np.ndarray:

@@ -10,27 +10,29 @@ map_Bump, bump        used where the picture looks like tangent-space normals; h
 Ka, Ks, Ke, ...       left out; Phong's specular colour has no counterpart but metals, which it was seldom meant for
 """
 
-import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from illuminerf.cues.broken_object import BrokenObject
+from illuminerf.cues.object_textures import decoded
 from illuminerf.cues.raw_objects import ImageFile, RawMaterial, ReadingLimits, file_beside
 
 # options of map_ statements and how many values follow each
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-bm": 1, "-boost": 1,
             "-mm": 2, "-type": 1, "-o": 3, "-s": 3, "-t": 3}  # fmt: skip
 _DEFAULT_ROUGHNESS = 0.5
+_MAX_BUMP_MEGAPIXELS = 64.0
 
 
 def read_mtl(model: Path, library: Path, limits: ReadingLimits) -> dict[str, RawMaterial]:
     """All materials of `library`, whose textures must lie in the folder of `model`.
 
     Raises:
-        BrokenObject: it cannot be read, or a texture is missing.
+        BrokenObject: it makes no sense, or a texture is missing.
+        OSError: it or a texture cannot be opened or read.
     """
     limits.check_file(library)
     found: dict[str, dict[str, list[str]]] = {}
@@ -63,7 +65,7 @@ def _material(
         return None if key is None else _image(model, library, lines[key], images, limits)
 
     def number(key: str) -> float | None:
-        return float(lines[key][0]) if lines.get(key) else None
+        return _finite(lines[key][0]) if lines.get(key) else None
 
     color_image = image("map_kd", "map_ka")
     color = _color(lines.get("kd"))
@@ -77,10 +79,11 @@ def _material(
     metallic = 1.0 if metal is not None else number("pm")
     normal = image("norm", "map_kn")
     bump = None if normal is not None else image("map_bump", "bump")
-    if bump is not None and _looks_like_normals(bump):
+    if bump is not None and _looks_like_normals(bump, limits):
         normal = bump
     if roughness is None and ({"ns", "illum", "ks"} & set(lines) or color is not None or color_image is not None):
-        roughness = _phong_roughness(lines, number("ns"), number("illum"))
+        exponent = float(lines["ns"][0]) if lines.get("ns") else None
+        roughness = _phong_roughness(lines, exponent, number("illum"))
     return RawMaterial(
         color=color,
         color_image=color_image,
@@ -107,7 +110,14 @@ def _phong_roughness(lines: dict[str, list[str]], exponent: float | None, illumi
 
 def _bump_multiplier(lines: dict[str, list[str]]) -> float:
     words: list[Any] = next((lines[key] for key in ("norm", "map_kn", "map_bump", "bump") if lines.get(key)), [])
-    return float(words[words.index("-bm") + 1]) if "-bm" in words else 1.0
+    return _finite(words[words.index("-bm") + 1]) if "-bm" in words else 1.0
+
+
+def _finite(word: str) -> float:
+    value = float(word)
+    if not np.isfinite(value):
+        raise ValueError(f"{word}, which is not finite")
+    return value
 
 
 def _color(words: list[str] | None) -> tuple[float, float, float] | None:
@@ -147,13 +157,12 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _looks_like_normals(image: ImageFile) -> bool:
+def _looks_like_normals(image: ImageFile, limits: ReadingLimits) -> bool:
     """Whether a picture is bluish as tangent-space normals are (z near 1, x and y about 0), not grey as heights."""
+    megapixels = min(limits.max_image_megapixels, _MAX_BUMP_MEGAPIXELS)
     try:
-        with Image.open(io.BytesIO(image.content)) as file:
-            if file.width * file.height > 2**26:
-                return False
-            red, green, blue = np.asarray(file.convert("RGB").resize((16, 16)), np.float32).mean((0, 1))
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        pixels = decoded(image, replace(limits, max_image_megapixels=megapixels))
+    except BrokenObject:  # it would be left out anyway
         return False
+    red, green, blue = pixels[..., :3].mean((0, 1))
     return bool(blue > 170 and abs(red - 128) < 40 and abs(green - 128) < 40)

@@ -30,6 +30,9 @@ UpAxis = Literal["auto", "y", "z"]
 # rows are our axes in y-up ones: (x, y, z) of such a file becomes (x, -z, y)
 _WORLD_FROM_Y_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float64)
 _OPAQUE_VERTICES = 250 / 255
+# What no check foresaw in a stranger's file still must not stop a run over many. OSError and MemoryError are not
+# among it: they tell of this machine.
+_BAD_CONTENT = (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError, struct.error)
 
 
 @dataclass(frozen=True)
@@ -96,9 +99,20 @@ def load_object(path: Path, generator: np.random.Generator, config: ObjectReadin
 
     Raises:
         BrokenObject: the object cannot be used; `reason` says why.
+        UserError: the file cannot be opened or read, for which the disk is to blame and not the object.
     """
     config = config or ObjectReading()
-    parts = _read(path, config.limits)
+    raw = _read(path, config.limits)
+    try:
+        return _made(path, raw, generator, config)
+    except BrokenObject:
+        raise
+    except (UserError, *_BAD_CONTENT) as error:
+        raise _unreadable(path, error) from error
+
+
+def _made(path: Path, parts: list[RawPart], generator: np.random.Generator, config: ObjectReading) -> Parts:
+    """Raw parts placed, with their textures decoded."""
     parts = merged_by_material(normalized(path.name, parts, _world_from_file(path, config.up_axis)))
     config.limits.check_faces(path.name, sum(len(part.faces) for part in parts))
     for part in parts:
@@ -123,13 +137,20 @@ def _read(path: Path, limits: ReadingLimits) -> list[RawPart]:
                 return read_obj(path, limits)
             case ".ply":
                 return read_ply(path, limits)
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, OSError, struct.error) as error:
-        # what no check foresaw in a stranger's file still must not stop a run over many
-        got = f"{type(error).__name__}: {error}"
-        raise BrokenObject("unreadable", f"{path.name} is unreadable", got=got) from error
-    except MemoryError as error:
-        raise BrokenObject("too large", f"{path.name} is too large", got="more than fits into memory") from error
+    except _BAD_CONTENT as error:
+        raise _unreadable(path, error) from error
+    except OSError as error:
+        # every other object would seem to be broken too, and be left out for ever
+        raise UserError(
+            f"{path.name} cannot be read from where it lies",
+            got=f"{type(error).__name__}: {error}",
+            fix="see that its disk or network share answers and may be read, and run the same command again",
+        ) from error
     raise BrokenObject("unreadable", f"{path.name} is of no known format", wanted=", ".join(OBJECT_SUFFIXES))
+
+
+def _unreadable(path: Path, error: Exception) -> BrokenObject:
+    return BrokenObject("unreadable", f"{path.name} is unreadable", got=f"{type(error).__name__}: {error}")
 
 
 def _world_from_file(path: Path, up_axis: UpAxis) -> np.ndarray:

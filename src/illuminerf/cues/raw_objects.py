@@ -3,6 +3,8 @@
 A reader turns its file into a `RawObject` of `RawPart`s; `object_files.load_object` makes meshes and materials of them.
 """
 
+import errno
+import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -42,12 +44,8 @@ class ReadingLimits:
             )
 
     def check_file(self, path: Path) -> None:
-        """BrokenObject where the file is missing ("unreadable") or too large."""
-        try:
-            size = path.stat().st_size
-        except OSError as error:
-            raise BrokenObject("unreadable", f"{path.name} is unreadable", got=str(error)) from error
-        self.check_bytes(path.name, size)
+        """BrokenObject "too large" where a file is; OSError where it cannot be looked at."""
+        self.check_bytes(path.name, path.stat().st_size)
 
     def check_bytes(self, name: str, size: int) -> None:
         """BrokenObject "too large" where a file of `size` bytes is."""
@@ -158,6 +156,7 @@ def file_beside(model: Path, uri: str) -> Path:
 
     Raises:
         BrokenObject: it lies outside the model's folder ("unreadable"), or is not there ("missing texture").
+        OSError: nobody can tell, since the disk does not answer or must not be read.
     """
     folder = model.parent.resolve()
     try:
@@ -171,7 +170,7 @@ def file_beside(model: Path, uri: str) -> Path:
             got=repr(uri),
             wanted="a path beside the model",
         )
-    if not found.is_file():
+    if not _is_file(model, uri, found):
         raise BrokenObject(
             "missing texture",
             f"{model.name} names a file that is missing",
@@ -179,3 +178,15 @@ def file_beside(model: Path, uri: str) -> Path:
             fix="copy it beside the model",
         )
     return found
+
+
+def _is_file(model: Path, uri: str, found: Path) -> bool:
+    """As `Path.is_file`, but only for what the model says is the answer no."""
+    try:
+        return stat.S_ISREG(found.stat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError as error:
+        if error.errno not in (errno.ENAMETOOLONG, errno.ELOOP):
+            raise
+        raise BrokenObject("unreadable", f"{model.name} names a file that cannot be resolved", got=repr(uri)) from error

@@ -28,9 +28,14 @@ class LightVariation:
 
     def __post_init__(self) -> None:
         if not (0 <= self.flip_probability <= 1 and 0 <= self.shuffle_probability <= 1):
-            raise UserError("probabilities must lie in [0, 1]")
+            got = f"{self.flip_probability:g} and {self.shuffle_probability:g}"
+            raise UserError("probabilities of flips and shuffles are out of range", got=got, wanted="values in [0, 1]")
         if not 0 < self.lowest_mean_radiance <= self.highest_mean_radiance:
-            raise UserError("the range of mean radiance must be positive and in order")
+            raise UserError(
+                "the range of mean radiance is empty or not positive",
+                got=f"{self.lowest_mean_radiance:g} to {self.highest_mean_radiance:g}",
+                wanted="0 < lowest <= highest",
+            )
 
 
 @dataclass(frozen=True)
@@ -49,14 +54,6 @@ class LightDraw:
     """Factor on the radiance."""
 
 
-def mean_radiance(light: EnvironmentMap) -> float:
-    """Radiance averaged over the sphere and the channels."""
-    height = light.linear_rgb.shape[0]
-    edges = np.cos(np.linspace(0, np.pi, height + 1))
-    weights = (edges[:-1] - edges[1:]) / 2
-    return float((light.linear_rgb.mean((1, 2)) * weights).sum())
-
-
 def draw_light(
     light: EnvironmentMap, generator: np.random.Generator, variation: LightVariation
 ) -> tuple[EnvironmentMap, LightDraw]:
@@ -67,7 +64,7 @@ def draw_light(
     is_flipped = bool(generator.random() < variation.flip_probability)
     is_shuffled = bool(generator.random() < variation.shuffle_probability)
     order = generator.permutation(3) if is_shuffled else np.arange(3)
-    mean = mean_radiance(light)
+    mean = float(light.mean_radiance().mean())
     scale = float(np.clip(mean, variation.lowest_mean_radiance, variation.highest_mean_radiance) / mean)
     turned = light.rotated(rotation).linear_rgb[..., order] * np.float32(scale)
     rows = turned[::-1] if is_flipped else turned

@@ -30,8 +30,13 @@ class MaterialVariation:
     """One or two other objects beside this one, see `composed`."""
 
     def __post_init__(self) -> None:
-        if not all(0 <= p <= 1 for p in (self.change_probability, self.swap_probability, self.compose_probability)):
-            raise UserError("probabilities must lie in [0, 1]")
+        probabilities = (self.change_probability, self.swap_probability, self.compose_probability)
+        if not all(0 <= p <= 1 for p in probabilities):
+            raise UserError(
+                "probabilities of material variations are out of range",
+                got=", ".join(f"{p:g}" for p in probabilities),
+                wanted="values in [0, 1]",
+            )
 
     @staticmethod
     def none() -> "MaterialVariation":

@@ -62,7 +62,8 @@ def training_item(name: str, arrays: dict[str, np.ndarray], size: int) -> Traini
     def averaged(values: Tensor) -> Tensor:
         return functional.avg_pool2d(values, factor) if factor > 1 else values
 
-    alpha = averaged(tensors["alpha"].float()[None, None] / 255)
+    covered = tensors["alpha"].float()[None, None] / 255
+    alpha = averaged(covered)
     straight = (alpha > _SMALLEST_COVERAGE) / alpha.clamp_min(_SMALLEST_COVERAGE)
 
     def radiance(name: str) -> Tensor:
@@ -70,11 +71,13 @@ def training_item(name: str, arrays: dict[str, np.ndarray], size: int) -> Traini
         return (averaged(finite.clamp(0, _LARGEST_RADIANCE)) * straight).clamp_max(_LARGEST_RADIANCE).half()
 
     def surface(name: str) -> Tensor:
-        return averaged(tensors[name].float().reshape(1, -1, height, height) / 255)[0].half()
+        # weighted by coverage: off the object there are zeros, which would darken its edges
+        values = tensors[name].float().reshape(1, -1, height, height) / 255
+        linear = linear_from_srgb(values) if name == "albedo" else values
+        return (averaged(linear * covered) / alpha.clamp_min(_SMALLEST_COVERAGE))[0].clamp_max(1).half()
 
-    albedo = linear_from_srgb(surface("albedo").float()).half()
     return TrainingItem(
-        name, radiance("targets"), radiance("cues"), alpha[0].half(), albedo, surface("roughness"),
+        name, radiance("targets"), radiance("cues"), alpha[0].half(), surface("albedo"), surface("roughness"),
         surface("metallic"),
     )  # fmt: skip
 

@@ -107,10 +107,6 @@ class EnvironmentMap:
         """Multiply the radiance by 2^stops."""
         return replace(self, linear_rgb=(self.linear_rgb * np.float32(2.0**stops)).astype(np.float32))
 
-    def flipped(self) -> "EnvironmentMap":
-        """Mirror the light in the vertical plane y = 0 (azimuth changes sign)."""
-        return replace(self, linear_rgb=np.ascontiguousarray(self.linear_rgb[:, ::-1]))
-
     def resized(self, height: int) -> "EnvironmentMap":
         """Average over areas, to more or fewer rows, so that small lamps keep their energy."""
         old = self.linear_rgb.shape[0]

@@ -32,12 +32,12 @@ class StepProgress:
         if console.is_terminal and console.width >= 40:
             narrow = console.width < 100
             columns = [
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(bar_width=10 if narrow else 30),
                 MofNCompleteColumn(),
             ]
             columns += [TimeRemainingColumn()] if narrow else [TimeElapsedColumn(), TimeRemainingColumn()]
-            self._bar = Progress(*columns, TextColumn("{task.fields[note]}"), console=console)
+            self._bar = Progress(*columns, TextColumn("{task.fields[note]}", markup=False), console=console)
             self._task = self._bar.add_task(description, total=total, completed=completed, note="")
 
     def advance(self, steps: int = 1, **numbers: float) -> None:
@@ -77,6 +77,12 @@ def track(iterable: Iterable[Item], description: str, total: int | None = None) 
             progress.advance()
 
 
-def say(message: str) -> None:
-    """Tell the person at the terminal something, above any bar."""
-    console.print(message, highlight=False)
+def say(message: str, *, markup: bool = False) -> None:
+    """Tell the person at the terminal something, above any bar.
+
+    Args:
+        message: printed as it stands, brackets and all.
+        markup: the message has Rich's markup, such as [bold]; what it holds of names, paths and other people's words
+            must then have gone through `rich.markup.escape`, or it loses its brackets or does not print at all.
+    """
+    console.print(message, highlight=False, markup=markup, emoji=False)
