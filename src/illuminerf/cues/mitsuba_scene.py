@@ -11,8 +11,9 @@ from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.workflow.device import derived_seed
 from illuminerf.workflow.errors import UserError
 
-# Mitsuba keeps all samples of a pass in memory; 2^21 of them need about 1 GB.
-_SAMPLES_PER_PASS = 2**21
+# Mitsuba keeps all samples of a pass in memory. 2^20 of them need about 0.5 GB; twice as many take longer per sample
+# (docs/log.md).
+_SAMPLES_PER_PASS = 2**20
 # Pixels of a side of what one thread of scalar_rgb renders. Left to itself Mitsuba makes as many blocks as there are
 # threads, and each block has its own random numbers.
 _BLOCK_SIDE = 32
