@@ -42,7 +42,7 @@ _OTHER_DEVICE = "see that the graphics card works and is free, or render with --
 # What Blender says where the machine is short of something, in lower case, and what to do: no fault of the item.
 _SHORTAGES = (
     (r"errno 28\b|no space left|disk full|errno 122\b|disk quota", _FREE_SPACE),
-    (r"out of gpu memory|(cuda|optix|hip)[ _]?error|(cuda|optix)_error|failed to create (cuda|optix)|cuda device"
+    (r"out of gpu memory|\b(cuda|optix|hip)[ _]?error|(cuda|optix)_error|failed to create (cuda|optix)|cuda device"
      r"|failed to (load|build) (cuda|optix) kernel|illegal address", _OTHER_DEVICE),
     (r"out of memory|cannot allocate memory|errno 12\b|memoryerror|bad_alloc|calloc returns null|malloc returns null",
      _LESS_AT_ONCE),
