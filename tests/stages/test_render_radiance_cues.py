@@ -71,7 +71,7 @@ def test_large_lights_are_averaged(tmp_path: Path) -> None:
     EnvironmentMap(np.random.default_rng(0).random((24, 48, 3)).astype(np.float32)).save(tmp_path / "big.exr")
     config = render_radiance_cues.Config(max_light_height=10)
     placed = render_radiance_cues.placed_light(tmp_path / "big.exr", config)
-    assert placed.linear_rgb.shape == (8, 16, 3)
+    assert placed.linear_rgb.shape == (10, 20, 3)
     assert placed.linear_rgb.mean() == pytest.approx(
         EnvironmentMap.load(tmp_path / "big.exr").linear_rgb.mean(), rel=1e-3
     )
