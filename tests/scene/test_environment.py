@@ -120,3 +120,17 @@ def test_unreadable_lights_are_refused(tmp_path: Path, name: str) -> None:
         (tmp_path / name).write_bytes(b"\x76\x2f\x31\x01 this is no picture")
     with pytest.raises(UserError, match="Fix|wanted"):
         EnvironmentMap.load(tmp_path / name)
+
+
+@pytest.mark.parametrize("height", [4, 10, 16, 24, 37])
+def test_any_height_keeps_the_energy(height: int) -> None:
+    light = random_light(16)
+    resized = light.resized(height)
+    assert resized.linear_rgb.shape == (height, 2 * height, 3)
+    np.testing.assert_allclose(resized.linear_rgb.mean((0, 1)), light.linear_rgb.mean((0, 1)), rtol=1e-5)
+    assert abs(light.linear_rgb[::3].mean() - light.linear_rgb.mean()) > 1e-4  # mere sampling would not
+
+
+def test_doubling_repeats_every_pixel() -> None:
+    light = random_light(16)
+    np.testing.assert_allclose(light.resized(32).linear_rgb, light.linear_rgb.repeat(2, 0).repeat(2, 1), rtol=1e-6)
