@@ -18,7 +18,7 @@ import pytest
 import trimesh
 from trimesh.visual.material import PBRMaterial
 
-from illuminerf.cues import training_shards
+from illuminerf.cues import shard_driver, training_shards
 from illuminerf.cues.object_views import ViewSettings
 from illuminerf.cues.renderer import CueSampling
 from illuminerf.cues.variations import MaterialVariation
@@ -201,7 +201,7 @@ def test_a_shard_of_other_objects_is_made_again(assets: tuple[Path, Path], tmp_p
 def test_packing_twice_changes_nothing(
     assets: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, real = tmp_path / "pairs", render_training_pairs.pack_shard
+    out, real = tmp_path / "pairs", shard_driver.pack_shard
 
     def pack_twice(task: Any) -> Any:
         first = real(task)
@@ -209,7 +209,7 @@ def test_packing_twice_changes_nothing(
         assert real(task) == first and (out / f"{task.shard}.tar").stat().st_mtime_ns == times
         return first
 
-    monkeypatch.setattr(render_training_pairs, "pack_shard", pack_twice)
+    monkeypatch.setattr(shard_driver, "pack_shard", pack_twice)
     render_training_pairs.run(*assets, CONFIG, out)
     assert not (out / "staging").exists()
 
@@ -217,7 +217,7 @@ def test_packing_twice_changes_nothing(
 def test_a_crash_costs_one_view(assets: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A worker that dies at the second view of the cube; first and third are rendered all the same."""
     config = replace(CONFIG, views=replace(VIEWS, num_views=3), choice=ObjectChoice(excluded=("broken",)))
-    real = render_training_pairs.render_object
+    real = shard_driver.render_object
 
     def dying(task: Any) -> Any:
         plan = training_shards.read_plan(task.out, task.plan)
@@ -230,7 +230,7 @@ def test_a_crash_costs_one_view(assets: tuple[Path, Path], tmp_path: Path, monke
         monkeypatch.setattr(training_shards, "render_views", views)
         return Crash("killed by the test")
 
-    monkeypatch.setattr(render_training_pairs, "render_object", dying)
+    monkeypatch.setattr(shard_driver, "render_object", dying)
     render_training_pairs.run(*assets, config, tmp_path / "out")
     manifest = read_json(tmp_path / "out" / "manifest.json")
     assert manifest["left_out"] == {"cube_1": {"reason": "crash", "message": "killed by the test"}}
@@ -277,17 +277,17 @@ def test_a_damaged_staged_item_is_made_again(
     assets: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     render_training_pairs.run(*assets, CONFIG, tmp_path / "whole")
-    out, real = tmp_path / "pairs", render_training_pairs.pack_shard
+    out, real = tmp_path / "pairs", shard_driver.pack_shard
 
     def spoil_then_pack(task: Any) -> Any:
         staged = sorted((out / "staging" / task.shard).glob("*.item"))[0]
         content = bytearray(staged.read_bytes())
         content[-700] ^= 255
         staged.write_bytes(content)
-        monkeypatch.setattr(render_training_pairs, "pack_shard", real)
+        monkeypatch.setattr(shard_driver, "pack_shard", real)
         return real(task)
 
-    monkeypatch.setattr(render_training_pairs, "pack_shard", spoil_then_pack)
+    monkeypatch.setattr(shard_driver, "pack_shard", spoil_then_pack)
     render_training_pairs.run(*assets, CONFIG, out)
     assert shards(out) == shards(tmp_path / "whole")
 
