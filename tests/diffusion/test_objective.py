@@ -21,6 +21,7 @@ from illuminerf.diffusion.objective import (
     stratified_timesteps,
     training_loss,
 )
+from illuminerf.diffusion.training_config import Config, Phase
 from illuminerf.diffusion.training_items import load_items
 from illuminerf.diffusion.training_state import WeightAverage, learning_rate
 from illuminerf.scene.images import srgb_from_linear
@@ -88,8 +89,23 @@ def test_weight_average_by_hand() -> None:
     start = float(average.tensors["weight"])
     with torch.no_grad():
         model.weight.add_(1.0)
-    average.update(model, step=100)
+    average.update(model, lambda name: 100)
     assert float(average.tensors["weight"]) == pytest.approx(start + 0.5)
+
+
+def test_what_begins_to_learn_late_does_not_stay_near_its_beginning() -> None:
+    config = Config(phases=(Phase(100, 64, "products"), Phase(50, 128)))
+    assert config.steps_trained("conditioning.texture.out.weight", 120) == 120
+    assert config.steps_trained("base.conv_in.weight", 120) == 20
+    model = torch.nn.Linear(1, 1)
+    late, early = WeightAverage(model, decay=0.999), WeightAverage(model, decay=0.999)
+    start = float(model.weight.detach())
+    with torch.no_grad():
+        model.weight.add_(1.0)
+    for step in range(100, 120):
+        late.update(model, lambda name, step=step: config.steps_trained("base." + name, step))
+        early.update(model, lambda name, step=step: step)
+    assert float(late.tensors["weight"]) > start + 0.99 and float(early.tensors["weight"]) < start + 0.9
 
 
 @pytest.mark.parametrize("with_diffusion", [False, True])

@@ -139,6 +139,16 @@ class Config:
             step -= phase.num_steps
         return self.phases[-1]
 
+    def steps_trained(self, name: str, step: int) -> int:
+        """For how many steps before `step` the tensor `name` has been trained; negative where its phase is to come."""
+        part = "products" if name.startswith("conditioning.texture.") else "diffusion"
+        start = 0
+        for phase in self.phases:
+            if phase.trains in (part, "all"):
+                break
+            start += phase.num_steps
+        return step - start
+
     def scale_momentum_at(self, step: int) -> float:
         """How fast the latent scales follow: a running mean at first, then slowly, and not in the last third."""
         start = 0

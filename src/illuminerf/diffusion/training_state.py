@@ -1,6 +1,6 @@
 """The state of a training run: averaged weights, learning rate, exact resume."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,18 +23,19 @@ def trained_tensors(model: nn.Module) -> dict[str, Tensor]:
 
 
 class WeightAverage:
-    """Exponential moving average of a model's parameters and buffers; the decay warms up with the steps."""
+    """Exponential moving average of a model's parameters and buffers; the decay of each warms up with the steps that it
+    has been trained for, so that what begins to learn late does not stay near its random beginning."""
 
     def __init__(self, model: nn.Module, decay: float) -> None:
         self.decay = decay
         self.tensors = {name: value.detach().clone() for name, value in trained_tensors(model).items()}
 
     @torch.no_grad()
-    def update(self, model: nn.Module, step: int) -> None:
-        """Move towards the model after optimisation step `step` (0, 1, ...)."""
-        decay = min(self.decay, (1 + step) / (10 + step))
+    def update(self, model: nn.Module, steps_trained: Callable[[str], int]) -> None:
+        """Move towards the model after a step; `steps_trained` says how many steps a tensor had been trained before."""
         for name, value in trained_tensors(model).items():
-            self.tensors[name].lerp_(value, 1 - decay)
+            steps = max(0, steps_trained(name))
+            self.tensors[name].lerp_(value, 1 - min(self.decay, (1 + steps) / (10 + steps)))
 
     @contextmanager
     def inside(self, model: nn.Module) -> Iterator[None]:

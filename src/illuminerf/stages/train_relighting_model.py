@@ -200,7 +200,7 @@ class _Training:
         self.accelerator.clip_grad_norm_(self.model.parameters(), 1.0)
         self.prepared.step()
         self.prepared.zero_grad()
-        self.average.update(self.model, step)
+        self.average.update(self.model, lambda name: config.steps_trained(name, step))
         self.step += 1
         return added
 
