@@ -37,6 +37,7 @@ from illuminerf.cues.training_cameras import CameraSphere
 from illuminerf.cues.variations import MaterialVariation
 from illuminerf.data.object_collection import list_objects
 from illuminerf.evaluation.metrics import psnr
+from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.example_assets import write_example_assets
 from illuminerf.scene.images import srgb_from_linear
 from illuminerf.workflow.artefact import peak_memory_gb
@@ -114,7 +115,7 @@ def view_settings(options: argparse.Namespace) -> ViewSettings:
     )
 
 
-def measured(objects: list[ObjectFile], lights: list[Path], settings: ViewSettings) -> dict[str, Any]:
+def measured(objects: list[ObjectFile], lights: list[EnvironmentMap], settings: ViewSettings) -> dict[str, Any]:
     """Time and bytes of all views of `objects`, and what was rendered of each first view."""
     watch = Stopwatch()
     views = list(range(settings.num_views))
@@ -209,7 +210,8 @@ def main() -> None:
         chosen = np.linspace(0, len(everything) - 1, min(options.objects, len(everything))).round().astype(int)
         objects = [ObjectFile(everything[i].id, str(everything[i].path), everything[i].licence) for i in chosen]
         settings = view_settings(options)
-        found = measured(objects, light_paths(folders[1]), settings)
+        lights = [EnvironmentMap.load(path).resized(settings.light_height) for path in light_paths(folders[1])]
+        found = measured(objects, lights, settings)
         num_items, seconds = len(found["sizes"]), found["seconds"]
         wall, cpu = (float(x) / num_items for x in seconds["total"])
         pairs = settings.num_lights * (settings.num_lights - 1)

@@ -22,12 +22,12 @@ from tests.diffusion.tiny import write_items
 SCRIPTS = Path(__file__).parents[2] / "benchmarks" / "gpu"
 
 
-def run(script: str, *arguments: str | Path, status: int = 0) -> dict[str, Any]:
+def run(script: str, *arguments: str | Path, statuses: tuple[int, ...] = (0,)) -> dict[str, Any]:
     """The JSON on the last line of a script's output."""
     command = [sys.executable, str(SCRIPTS / script), *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
-    assert done.returncode == status, done.stderr[-2000:]
+    assert done.returncode in statuses, done.stderr[-2000:]
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
 
@@ -42,10 +42,12 @@ def test_kernels_agree_with_their_twins() -> None:
 @pytest.mark.slow
 def test_pairs_are_rendered_until_time_is_up_and_gone_on_with(tmp_path: Path) -> None:
     out = tmp_path / "pairs"
-    first = run("render_pairs.py", "--out", out, "--tiny", "--minutes", "0.001", "--workers", "1", status=1)
-    assert first["ended"] == "time is up" and first["items"]["new"] == 0, "nothing rendered is not a success"
+    # status 1 where nothing was rendered in time, which is not a success; a busy machine may end it late
+    first = run("render_pairs.py", "--out", out, "--tiny", "--minutes", "0.001", "--workers", "1", statuses=(0, 1))
+    before = first["items"]["new"]
+    assert first["ended"] == "time is up" and first["passed"] == (before > 0)
     second = run("render_pairs.py", "--out", out, "--tiny", "--minutes", "4", "--workers", "1", "--device", "cpu")
-    assert second["ended"] == "done" and second["items"] == {"in_shards": 6, "waiting": 0, "new": 6, "checked": 6}
+    assert second["ended"] == "done" and second["items"] == {"in_shards": 6, "waiting": 0, "new": 6 - before, "checked": 6}
     third = run("render_pairs.py", "--out", out, "--tiny", "--workers", "1", "--device", "cpu")
     assert third["items"]["new"] == 0 and third["passed"]
     assert len(list(iterate_items(out))) == 6

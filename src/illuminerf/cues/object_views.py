@@ -17,7 +17,7 @@ from illuminerf.cues.blender_renderer import BlenderFailed, BlenderItemRenderer,
 from illuminerf.cues.broken_object import BrokenObject
 from illuminerf.cues.item_renderer import ItemRenderer, MitsubaItemRenderer
 from illuminerf.cues.materials import Parts
-from illuminerf.cues.mitsuba_variant import load_mitsuba
+from illuminerf.cues.mitsuba_variant import choose_variant, load_mitsuba
 from illuminerf.cues.object_files import ObjectReading, load_object
 from illuminerf.cues.renderer import CueSampling
 from illuminerf.cues.training_cameras import CameraSphere, draw_camera
@@ -96,7 +96,8 @@ class ViewSettings:
         if self.renderer == "blender":
             worker_command(self.blender, Path())
             return "blender"
-        return str(load_mitsuba(self.cue_sampling.device).variant())
+        load_mitsuba(self.cue_sampling.device)
+        return choose_variant(self.cue_sampling.device)
 
     def item_renderer(self) -> ItemRenderer:
         """The path tracer."""
