@@ -47,7 +47,8 @@ def test_pairs_are_rendered_until_time_is_up_and_gone_on_with(tmp_path: Path) ->
     before = first["items"]["new"]
     assert first["ended"] == "time is up" and first["passed"] == (before > 0)
     second = run("render_pairs.py", "--out", out, "--tiny", "--minutes", "4", "--workers", "1", "--device", "cpu")
-    assert second["ended"] == "done" and second["items"] == {"in_shards": 6, "waiting": 0, "new": 6 - before, "checked": 6}
+    wanted = {"in_shards": 6, "waiting": 0, "new": 6 - before, "checked": 6}
+    assert second["ended"] == "done" and second["items"] == wanted
     third = run("render_pairs.py", "--out", out, "--tiny", "--workers", "1", "--device", "cpu")
     assert third["items"]["new"] == 0 and third["passed"]
     assert len(list(iterate_items(out))) == 6
