@@ -95,8 +95,7 @@ def render_object(task: ObjectTask) -> dict[str, LeftOut | None]:
             fix="install the same libraries everywhere (for llvm_ad_rgb: libllvm19)",
         )
     folder, keys = f"staging/{plan.shard_name(task.index)}", plan.keys(task.index)
-    staged = set(storage.names(folder))
-    views = [view for view, key in enumerate(keys) if not staged & {f"{key}.item", f"{key}.json"}]
+    views = _missing_views(storage, plan, task.index)
     result: dict[str, LeftOut | None] = {key: None for key in keys}
     lights = StoredLights(storage.url, plan.lights)
     for view, made in render_views(plan.objects, task.index, lights, plan.views, views):
@@ -112,13 +111,18 @@ def render_object(task: ObjectTask) -> dict[str, LeftOut | None]:
 
 def leave_out_next(storage: Storage, plan: Plan, index: int, why: LeftOut) -> str | None:
     """Give up the view that an object's dead workers were at, the first that is not staged; its key."""
-    folder = f"staging/{plan.shard_name(index)}"
-    staged = set(storage.names(folder))
-    for key in plan.keys(index):
-        if f"{key}.item" not in staged and f"{key}.json" not in staged:
-            storage.write_json(f"{folder}/{key}.json", to_json(why))
-            return key
-    return None
+    missing = _missing_views(storage, plan, index)
+    if not missing:
+        return None
+    key = plan.keys(index)[missing[0]]
+    storage.write_json(f"staging/{plan.shard_name(index)}/{key}.json", to_json(why))
+    return key
+
+
+def _missing_views(storage: Storage, plan: Plan, index: int) -> list[int]:
+    """Views of an object that are neither staged nor given up."""
+    staged = set(storage.names(f"staging/{plan.shard_name(index)}"))
+    return [view for view, key in enumerate(plan.keys(index)) if not staged & {f"{key}.item", f"{key}.json"}]
 
 
 def pack_shard(task: PackTask) -> ShardIndex | list[int]:
