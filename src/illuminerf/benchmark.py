@@ -96,6 +96,7 @@ def relighting_model_command(
     steps: int | None = None,
     sampler: Sampler | None = None,
     temperature: float | None = None,
+    knows_shading: bool = False,
     device: str = "auto",
 ) -> None:
     """Score a relighting model on rendered pairs of held-out objects and lights (see docs/model_card.md).
@@ -111,6 +112,8 @@ def relighting_model_command(
         steps: Denoising steps; the model's usual number where it is left out.
         sampler: ddpm, ddim or dpm_solver; the model's usual one where it is left out.
         temperature: Factor on the initial noise; the model's usual one where it is left out.
+        knows_shading: Tell the model the diffuse cue under the input light, which the pipeline estimates from all
+            photographs together, and which no baseline here has.
         device: auto, cpu or cuda.
     """
     network = pretrained_model(model, resolve_device(device))
@@ -120,7 +123,7 @@ def relighting_model_command(
     chosen_sampler = usual.sampler if sampler is None else sampler
     factor = usual.temperature if temperature is None else temperature
     num_pairs = len(held_out_pairs(items, pairs))
-    scores, _ = evaluate(network, items, num_pairs, samples, num_steps, chosen_sampler, temperature=factor)
+    scores, _ = evaluate(network, items, num_pairs, samples, num_steps, chosen_sampler, 8, factor, knows_shading)
     named = {
         f"{metric}{suffix}": scores[estimate][metric]
         for metric in ("psnr", "ssim")
@@ -130,6 +133,7 @@ def relighting_model_command(
     named["spread"] = scores["spread"]["srgb"]
     if json is not None:
         how = {"samples": samples, "steps": num_steps, "sampler": chosen_sampler, "temperature": factor}
+        how["knows_shading"] = knows_shading
         write_json(json, named | {"renders": len(items), "pairs": num_pairs, **how})
     drawn = f"{len(items)} renders, {num_pairs} pairs, {samples} samples"
     table = Table(title=f"Relighting model on {drawn}: over the object, rescaled")

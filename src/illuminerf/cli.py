@@ -215,7 +215,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
         relight_views.run,
         relight_views.Config,
         "Draw relit samples of every photograph; the model is a folder, or the word embedded or dilightnet.",
-        {"capture": Path, "cues": Path, "model": str},
+        {"capture": Path, "cues": Path, "model": str, "illumination": Path | None},
     ),
     "fit-latent-nerf": _stage(
         fit_latent_nerf.run,

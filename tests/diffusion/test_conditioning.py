@@ -15,7 +15,10 @@ from illuminerf.diffusion.conditioning import (
     TextureConfig,
     TextureNetwork,
     padded_tokens,
+    unlit,
 )
+from illuminerf.diffusion.cue_coding import encode_cues
+from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
 from tests.diffusion.tiny import TINY, random_condition_inputs
 
 # (channels, size) after every convolution at 512 x 512, read off the paper's tables.
@@ -49,7 +52,8 @@ def test_convnet_2_has_dilightnets_layers() -> None:
     with torch.device("meta"):
         network = TextureNetwork(TextureConfig())
         convolutions = [m for m in network.modules() if isinstance(m, nn.Conv2d | nn.ConvTranspose2d)]
-        assert network(torch.empty(1, 4, 512, 512), torch.empty(1, 12, 512, 512)).shape == (1, 12, 512, 512)
+        inputs = (torch.empty(1, channels, 512, 512) for channels in (4, 12, 3))
+        assert network(*inputs).shape == (1, 12, 512, 512)
     found = [(m.in_channels, m.out_channels, m.kernel_size[0], m.stride[0]) for m in convolutions]
     block = [(128, 128, 3, 1)] * 2
     wanted = [(4, 32, 3, 1), (32, 64, 3, 2), (64, 128, 3, 2), *block * 4]
@@ -93,7 +97,7 @@ def test_products_are_texture_times_cues_elementwise() -> None:
         conditioning = Conditioning(config)
         image, cues = random_condition_inputs(2, 32)
         products = conditioning(image, cues).products
-        torch.testing.assert_close(products, conditioning.texture(image, cues) * cues)
+        torch.testing.assert_close(products, conditioning.texture(image, cues, 0 * cues[:, :3]) * cues)
         assert (conditioning(image, 0 * cues).products == 0).all()
         changed = cues.clone()
         changed[:, 5, 3, 4] += 1
@@ -103,23 +107,43 @@ def test_products_are_texture_times_cues_elementwise() -> None:
         assert difference.max() == 0
 
 
-def test_material_texture_starts_as_a_dim_copy_and_is_never_negative() -> None:
+def material_network() -> TextureNetwork:
     torch.manual_seed(0)
-    network = TextureNetwork(TextureConfig((8, 8, 16), 1, patch=4, is_material=True))
-    image = torch.rand(1, 4, 32, 32)
-    texture = network(image, torch.zeros(1, 12, 32, 32))
+    return TextureNetwork(TextureConfig((8, 8, 32), 2, patch=4, is_material=True, num_attention=2))
+
+
+def test_material_starts_as_a_rough_dielectric_of_the_unlit_image() -> None:
+    albedo, shading = 0.05 + 0.9 * torch.rand(1, 3, 32, 32), 0.2 + 2 * torch.rand(1, 3, 32, 32)
+    lit = srgb_from_linear((albedo * shading).clamp_max(1))
+    seen = albedo * shading < 1
+    image = torch.cat([lit, torch.ones(1, 1, 32, 32)], 1)
+    texture = material_network()(image, torch.rand(1, 12, 32, 32), encode_cues(shading))
     assert (texture >= 0).all()
-    assert (texture[:, :3] - (0.2 + 0.6 * image[:, :3])).abs().mean() < 0.15
-    assert texture[:, 3:].mean() < 0.1
+    assert (texture[:, :3] ** 2.2 - albedo)[seen].abs().max() < 0.02
+    assert (texture[:, 9:] ** 2.2 - 0.04).abs().max() < 0.001 and texture[:, 3:9].max() < 0.02
+    wrong = material_network()(image, torch.rand(1, 12, 32, 32), encode_cues(shading.flip(-1)))
+    assert (wrong[:, :3] ** 2.2 - albedo)[seen].abs().mean() > 0.1
 
 
-@pytest.mark.parametrize("sees_cues", [False, True])
-def test_cues_reach_the_texture_only_where_it_sees_them(sees_cues: bool) -> None:
+def test_unlit_images_are_straight_and_need_no_shading() -> None:
     torch.manual_seed(0)
-    config = TextureConfig((8, 8, 32), 2, patch=4, is_material=True, sees_cues=sees_cues, num_attention=2)
-    network = TextureNetwork(config)
+    straight, alpha = torch.rand(1, 3, 8, 8), 0.1 + 0.9 * torch.rand(1, 1, 8, 8)
+    image = torch.cat([straight * alpha, alpha], 1)
+    unknown = unlit(image, torch.zeros(1, 3, 8, 8))
+    torch.testing.assert_close(unknown, (linear_from_srgb(straight) ** (1 / 2.2) / 0.76).clamp_max(1.02))
+    assert torch.isfinite(unlit(torch.zeros(1, 4, 8, 8), torch.zeros(1, 3, 8, 8))).all()
+
+
+@pytest.mark.parametrize("is_material", [False, True])
+def test_cues_and_shading_reach_the_texture_only_of_materials(is_material: bool) -> None:
+    torch.manual_seed(0)
+    network = material_network() if is_material else TextureNetwork(TextureConfig((8, 8, 32), 2, patch=4))
+    nn.init.normal_(network.out.weight)
     image, cues = random_condition_inputs(2, 32)
-    assert torch.equal(network(image, cues), network(image, 0 * cues)) != sees_cues
+    shading = cues[:, :3]
+    texture = network(image, cues, shading)
+    assert torch.equal(texture, network(image, 0 * cues, shading)) != is_material
+    assert torch.equal(texture, network(image, cues, 0 * shading)) != is_material
 
 
 def test_attention_starts_as_identity_and_then_reaches_every_place() -> None:

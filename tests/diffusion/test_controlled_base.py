@@ -203,9 +203,10 @@ def test_both_kinds_relight_photographs(base: Path) -> None:
     image[3] = 0
     image[3, 5:35, 6:40] = 1
     image[:3] *= image[3]
-    relit = relight_photographs(model, [Photograph(image, cues)], [[1, 2, 3]], 2)[0]
+    photograph = Photograph(image, cues, torch.zeros_like(cues[:3]))
+    relit = relight_photographs(model, [photograph], [[1, 2, 3]], 2)[0]
     assert relit.shape == (3, 3, 40, 44)
     assert (relit[:, :, image[3] == 0] == 0).all() and float(relit.max()) <= 1
-    few = relight_photographs(model, [Photograph(image, cues)], [[1, 2, 3]], 2, samples_at_once=2)[0]
+    few = relight_photographs(model, [photograph], [[1, 2, 3]], 2, samples_at_once=2)[0]
     torch.testing.assert_close(few, relit, atol=1e-4, rtol=0)
     assert (relit[0] - relit[1]).abs().max() > 1e-3

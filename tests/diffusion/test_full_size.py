@@ -47,22 +47,25 @@ def test_at_the_models_own_size_it_is_plain_sampling() -> None:
     model = with_noise_in_every_weight(tiny_model())
     image, coded = random_condition_inputs(1, 32)
     image[:, 3] = 1
-    relit = relight_photographs(model, [Photograph(image[0], coded[0] ** 2.2)], [[7]], 3)[0]
-    torch.testing.assert_close(relit, sample_relit(model, image, coded, [[7]], 3)[0], atol=1e-4, rtol=0)
+    shading = torch.rand(1, 3, 32, 32)
+    relit = relight_photographs(model, [Photograph(image[0], coded[0] ** 2.2, shading[0] ** 2.2)], [[7]], 3)[0]
+    wanted = sample_relit(model, image, coded, [[7]], 3, shading=shading)[0]
+    torch.testing.assert_close(relit, wanted, atol=1e-4, rtol=0)
+    assert (sample_relit(model, image, coded, [[7]], 3)[0] - wanted).abs().max() > 0.01
 
 
 def test_a_dim_light_is_exposed_for_the_model_and_dim_again_in_the_result() -> None:
     model = with_noise_in_every_weight(tiny_model())
     image, coded = random_condition_inputs(1, 32)
     image[:, 3] = 1
-    cues = 0.3 * coded[0] ** 2.2
-    plain = relight_photographs(model, [Photograph(image[0], cues)], [[7]], 3)[0]
-    dim = relight_photographs(model, [Photograph(image[0], 0.1 * cues)], [[7]], 3, exposure=10.0)[0]
+    cues, unknown = 0.3 * coded[0] ** 2.2, torch.zeros(3, 32, 32)
+    plain = relight_photographs(model, [Photograph(image[0], cues, unknown)], [[7]], 3)[0]
+    dim = relight_photographs(model, [Photograph(image[0], 0.1 * cues, unknown)], [[7]], 3, exposure=10.0)[0]
     unclipped = (plain > 0.01) & (plain < 0.99)
     assert unclipped.float().mean() > 0.3
     ratio = linear_from_srgb(dim)[unclipped] / linear_from_srgb(plain)[unclipped]
     torch.testing.assert_close(ratio, torch.full_like(ratio, 0.1), atol=1e-3, rtol=0)
-    blind = relight_photographs(model, [Photograph(image[0], 0.1 * cues)], [[7]], 3)[0]
+    blind = relight_photographs(model, [Photograph(image[0], 0.1 * cues, unknown)], [[7]], 3)[0]
     assert (linear_from_srgb(blind)[unclipped] / linear_from_srgb(plain)[unclipped] - 0.1).abs().mean() > 0.01
 
 

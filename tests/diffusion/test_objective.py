@@ -34,7 +34,9 @@ def lambertian_batch(brightness: float = 0.4) -> tuple[torch.Tensor, Batch]:
     alpha = (torch.rand(2, 1, 16, 16) > 0.3).float()
     target = srgb_from_linear(lobes.sum(1)).clamp_max(1) * alpha
     products = encode_cues(lobes.flatten(1, 2))
-    return products, Batch(torch.cat([target, alpha], 1), products, target, alpha, torch.rand(2, 5, 16, 16))
+    return products, Batch(
+        torch.cat([target, alpha], 1), products, target, alpha, torch.rand(2, 5, 16, 16), torch.zeros(2, 3, 16, 16)
+    )
 
 
 def test_anchor_loss_is_zero_for_the_truth_and_by_hand_otherwise() -> None:

@@ -9,7 +9,6 @@ from safetensors.torch import save
 
 from illuminerf.diffusion.augmentation import (
     AugmentationConfig,
-    Example,
     make_batch,
     plain_example,
     stack_examples,
@@ -26,7 +25,7 @@ from illuminerf.workflow.shards import sample_tar, write_shard
 from illuminerf.workflow.storage import Storage
 from tests.diffusion.tiny import write_items
 
-EXACT = AugmentationConfig(composited_share=0.0)
+EXACT = AugmentationConfig(composited_share=0.0, dents=0.0)
 
 
 def drawn(items: list, count: int, config: AugmentationConfig, seed: int = 0) -> Batch:
@@ -127,16 +126,46 @@ def test_albedo_is_averaged_as_light() -> None:
 
 
 def test_plain_examples_are_exposed_alike(folder: Path) -> None:
-    image, cues, target, alpha, surface = plain_example(load_items(folder, 32)[0], 0, 2)
+    item = load_items(folder, 32)[0]
+    example = plain_example(item, 0, 2)
+    image, cues, target, alpha, surface, shading = example
     assert float(diffuse_level(cues, alpha)) == pytest.approx(0.55, rel=1e-2)
-    batch = stack_examples([Example(image, cues, target, alpha, surface)])
+    assert not shading.any()
+    batch = stack_examples([example])
     assert batch.masked_image.shape == (1, 4, 32, 32)
     assert float(batch.masked_image.max()) <= 1
+    known = plain_example(item, 0, 2, knows_shading=True).shading
+    torch.testing.assert_close(known, plain_example(item, 2, 0).cues[:3])
+    assert not torch.allclose(known, cues[:3], rtol=0.1)
+
+
+def test_estimated_shading_is_near_the_truth_as_often_as_asked(folder: Path) -> None:
+    items = load_items(folder, 32)
+
+    def shading_errors(**settings: float) -> torch.Tensor:
+        config = AugmentationConfig(mixture_share=0.0, exposure=0.0, turns=False, composited_share=1.0, **settings)
+        generators = [torch.Generator().manual_seed(seed) for seed in range(40)]
+        batch = make_batch(items, config, generators)
+        inside = batch.alpha > 0.9
+        known = batch.shading.amax((1, 2, 3)) > 0
+        # the discs' colour is one per image, but for gloss: image / shading is nearly flat where shading is right
+        ratio = (linear_from_srgb(batch.masked_image[:, :3]) / batch.shading.clamp_min(1e-3) ** 2.2).log()
+        spread = [float(row[:, mask[0]].std(1).mean()) for row, mask in zip(ratio, inside, strict=True)]
+        return torch.where(known, torch.tensor(spread), torch.nan)
+
+    exact = shading_errors(unknown_shading_share=0.0, shading_error=0.0, dents=0.0)
+    wrong = shading_errors(unknown_shading_share=0.0, shading_error=2.0, dents=0.0)
+    dented = shading_errors(unknown_shading_share=0.0, shading_error=0.0, dents=0.5)
+    assert not exact.isnan().any()
+    assert wrong.nanmedian() > exact.nanmedian() + 0.02 and dented.nanmedian() > exact.nanmedian() + 0.02
+    shares = shading_errors(unknown_shading_share=0.5).isnan().float().mean()
+    assert 0.25 < float(shares) < 0.75
+    assert shading_errors(unknown_shading_share=1.0).isnan().all()
 
 
 def test_bound_by_true_materials_is_nearly_exact_on_the_discs(folder: Path) -> None:
     item = load_items(folder, 32)[0]
-    _, cues, target, alpha, surface = plain_example(item, 0, 1)
+    _, cues, target, alpha, surface, _ = plain_example(item, 0, 1)
     truth, ours = (srgb_from_linear(x).clamp_max(1)[None] * alpha for x in (target, composited(surface, cues)))
     assert float(masked_psnr(rescaled(ours, truth), truth, alpha[None])) > 35
     assert float(masked_psnr(rescaled(truth.roll(5, 2), truth), truth, alpha[None])) < 30

@@ -52,7 +52,7 @@ def samples(folder: Path) -> dict[str, bytes]:
 
 
 def test_samples_are_complete_seeded_and_masked(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
-    out = relight_views.run(*inputs, CONFIG, tmp_path / "out")
+    out = relight_views.run(*inputs, None, CONFIG, tmp_path / "out")
     assert sorted(samples(out)) == [f"{view:03d}_{k:02d}.png" for view in range(3) for k in range(2)]
     first, second = (read_png(sample_path(out, 0, k)) for k in range(2))
     assert first.shape == (SIZE, SIZE, 3)
@@ -61,7 +61,7 @@ def test_samples_are_complete_seeded_and_masked(inputs: tuple[Path, Path, Path],
     assert np.abs(first - second).max() > 0.02
     seeds = json.loads((out / "seeds.json").read_text())
     assert len({seed for row in seeds.values() for seed in row}) == 6
-    again = relight_views.run(*inputs, CONFIG, tmp_path / "again")
+    again = relight_views.run(*inputs, None, CONFIG, tmp_path / "again")
     assert samples(again) == samples(out)
 
 
@@ -79,12 +79,12 @@ def test_one_exposure_for_all_views_from_the_diffuse_cue(inputs: tuple[Path, Pat
 
 
 def test_existing_samples_are_kept_and_missing_ones_made(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
-    out = relight_views.run(*inputs, CONFIG, tmp_path / "out")
+    out = relight_views.run(*inputs, None, CONFIG, tmp_path / "out")
     whole = samples(out)
     (out / "DONE").unlink()
     sample_path(out, 2, 1).unlink()
     kept = sample_path(out, 0, 0).stat().st_mtime_ns
-    relight_views.run(*inputs, CONFIG, out)
+    relight_views.run(*inputs, None, CONFIG, out)
     assert sample_path(out, 0, 0).stat().st_mtime_ns == kept
     # A batch of another make-up may round differently: one level of 256.
     remade = read_png(sample_path(out, 2, 1))
@@ -97,7 +97,7 @@ def test_detail_of_the_photograph_survives(inputs: tuple[Path, Path, Path], tmp_
     torch.manual_seed(0)
     save_model(tiny_model(), tmp_path / "copying")  # starts as 0.2 + 0.6 * image
     model = tmp_path / "copying"
-    out = relight_views.run(inputs[0], inputs[1], model, CONFIG, tmp_path / "out")
+    out = relight_views.run(inputs[0], inputs[1], model, None, CONFIG, tmp_path / "out")
     photograph = read_png(inputs[0] / "images" / "000.png")
     inside = photograph[..., 3] == 1
     mean = np.mean([read_png(sample_path(out, 0, k)) for k in range(2)], 0)
@@ -111,15 +111,15 @@ def test_detail_of_the_photograph_survives(inputs: tuple[Path, Path, Path], tmp_
 
 def test_shares_make_what_one_process_makes(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
     settings = Config(**{**vars(CONFIG), "batch_size": 1})
-    whole = samples(relight_views.run(*inputs, settings, tmp_path / "whole"))
+    whole = samples(relight_views.run(*inputs, None, settings, tmp_path / "whole"))
     out = tmp_path / "shared"
     for shard in ("1/2", "0/2"):
         assert not (out / "DONE").exists()
-        relight_views.run(*inputs, Config(**{**vars(settings), "shard": shard}), out)
+        relight_views.run(*inputs, None, Config(**{**vars(settings), "shard": shard}), out)
     assert samples(out) == whole
     assert (out / "DONE").exists()
     assert (out / "DONE").read_bytes() == (tmp_path / "whole" / "DONE").read_bytes()
-    relight_views.run(*inputs, settings, out)  # finished, whoever asks
+    relight_views.run(*inputs, None, settings, out)  # finished, whoever asks
     with pytest.raises(UserError, match="0/4"):
         Config(shard="4/4")
 
@@ -131,7 +131,7 @@ def test_torchrun_shares_the_work(
     for rank in (0, 1):
         monkeypatch.setenv("RANK", str(rank))
         monkeypatch.setenv("WORLD_SIZE", "2")
-        relight_views.run(*inputs, settings, tmp_path / "out")
+        relight_views.run(*inputs, None, settings, tmp_path / "out")
         assert len(samples(tmp_path / "out")) == (4, 6)[rank]
 
 
@@ -142,11 +142,23 @@ def test_a_model_on_a_base_and_bfloat16(inputs: tuple[Path, Path, Path], tmp_pat
     runs = {}
     for precision in ("float32", "bfloat16"):
         config = Config(num_samples=2, num_steps=2, batch_size=2, samples_at_once=1, precision=precision, device="cpu")  # type: ignore[arg-type]
-        out = relight_views.run(inputs[0], inputs[1], tmp_path / "controlled", config, tmp_path / precision)
+        out = relight_views.run(inputs[0], inputs[1], tmp_path / "controlled", None, config, tmp_path / precision)
         runs[precision] = np.stack([read_png(sample_path(out, view, k)) for view in range(3) for k in range(2)])
     difference = np.abs(runs["float32"] - runs["bfloat16"])
     assert difference.max() > 0 and difference.mean() < 0.02
     assert np.abs(runs["float32"][0] - runs["float32"][1]).mean() > difference.mean()
+
+
+def test_the_photographs_own_light_is_a_hint(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    alpha = read_exr(inputs[1] / "cues" / "000.exr")["A"]
+    for view in range(3):
+        slope = np.linspace(0.1, 1.5, SIZE, dtype=np.float32) * alpha
+        write_exr(tmp_path / "light" / "shading" / f"{view:03d}.exr", {"R": slope, "G": slope, "B": slope, "A": alpha})
+    plain = samples(relight_views.run(*inputs, None, CONFIG, tmp_path / "plain"))
+    hinted = samples(relight_views.run(*inputs, tmp_path / "light", CONFIG, tmp_path / "hinted"))
+    assert all(plain[name] != hinted[name] for name in plain)
+    with pytest.raises(UserError, match="other"):
+        relight_views.run(*inputs, tmp_path / "light", CONFIG, tmp_path / "plain")
 
 
 def test_the_published_weights_relight_by_their_name(
@@ -158,7 +170,7 @@ def test_the_published_weights_relight_by_their_name(
     write_published(folder, base)
     write_json(folder / "relighting_model.json", to_json(tiny_config(base, cue_coding="srgb8")))
     config = replace(PRESETS["dilightnet"].relighting, num_samples=2, num_steps=2, device="cpu")
-    out = relight_views.run(inputs[0], inputs[1], "dilightnet", config, tmp_path / "out")
+    out = relight_views.run(inputs[0], inputs[1], "dilightnet", None, config, tmp_path / "out")
     images = [read_png(sample_path(out, 1, k)) for k in range(2)]
     alpha = read_png(inputs[0] / "images" / "001.png")[..., 3]
     assert images[0].shape == (SIZE, SIZE, 3) and (images[0][alpha == 0] == 0).all()
@@ -172,12 +184,12 @@ def _blurred(image: np.ndarray) -> np.ndarray:
 def test_what_does_not_fit_is_a_user_error(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
     capture, cues, model = inputs
     with pytest.raises(UserError, match="holds no relighting model"):
-        relight_views.run(capture, cues, tmp_path / "none", CONFIG, tmp_path / "out")
+        relight_views.run(capture, cues, tmp_path / "none", None, CONFIG, tmp_path / "out")
     write_exr(cues / "cues" / "001.exr", {name: np.zeros((8, 8), np.float32) for name in [*CUES, "A"]})
     with pytest.raises(UserError, match="does not fit the capture"):
-        relight_views.run(capture, cues, model, CONFIG, tmp_path / "out")
+        relight_views.run(capture, cues, model, None, CONFIG, tmp_path / "out")
     (cues / "cues" / "001.exr").unlink()
     with pytest.raises(UserError, match="missing"):
-        relight_views.run(capture, cues, model, CONFIG, tmp_path / "out2")
+        relight_views.run(capture, cues, model, None, CONFIG, tmp_path / "out2")
     with pytest.raises(UserError, match="at least 1"):
         Config(num_samples=0)

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
-from illuminerf.diffusion.cue_coding import CueCoding, code_cues
+from illuminerf.diffusion.cue_coding import CueCoding, code_cues, encode_cues
 from illuminerf.diffusion.materials import composited
 from illuminerf.diffusion.objective import Batch
 from illuminerf.diffusion.training_items import TrainingItem, diffuse_level
@@ -37,13 +38,15 @@ class Example(NamedTuple):
     """Coverage."""
     surface: Float[Tensor, "5 height width"]
     """Base colour, metallicity, roughness."""
+    shading: Float[Tensor, "3 height width"]
+    """Diffuse cue under the input light, as far as it is known; zeros: not at all."""
 
 
 @dataclass(frozen=True)
 class AugmentationConfig:
     """How examples are varied."""
 
-    composited_share: float = 0.4
+    composited_share: float = 0.3
     """Share of examples whose material is random and composited from the cues."""
     mixture_share: float = 0.5
     """Share of input and of target lights that are mixtures of two rendered lights rather than one."""
@@ -51,16 +54,24 @@ class AugmentationConfig:
     """Standard deviation of the log gain per colour channel of each light in a mixture."""
     exposure: float = 0.4
     """Standard deviation of the log exposure of input and target, independently."""
+    unknown_shading_share: float = 0.35
+    """Share of examples whose shading under the input light is kept from the model."""
+    shading_error: float = 0.4
+    """How wrong the others' shading is: another light mixed in, contrast and colours changed; 0: exact."""
+    dents: float = 0.1
+    """Largest standard deviation of the log of a smooth noise on the diffuse cues and the shading, three times as much
+    on the specular ones: estimated meshes are dented where the renders' are not."""
     turns: bool = True
     """Turn pictures by quarters: light and view turn together, so cues and target still agree."""
     level: float = TRAINING_LEVEL
     """Median over examples of the mean diffuse cue (a white object's mean radiance)."""
 
     def __post_init__(self) -> None:
-        if not (0 <= self.composited_share <= 1 and 0 <= self.mixture_share <= 1):
+        shares = (self.composited_share, self.mixture_share, self.unknown_shading_share)
+        if not all(0 <= share <= 1 for share in shares):
             raise ValueError("shares are between 0 and 1")
-        if min(self.tint, self.exposure, self.level) < 0:
-            raise ValueError("tint, exposure and level are not negative")
+        if min(self.tint, self.exposure, self.level, self.shading_error, self.dents) < 0:
+            raise ValueError("tint, exposure, level, shading_error and dents are not negative")
 
 
 def make_batch(
@@ -80,21 +91,36 @@ def make_batch(
 
 def stack_examples(examples: list[Example], coding: CueCoding = "power") -> Batch:
     """Examples to a coded batch in channels-last layout."""
-    image, cues, target, alpha, surface = (torch.stack(parts) for parts in zip(*examples, strict=True))
+    image, cues, target, alpha, surface, shading = (torch.stack(parts) for parts in zip(*examples, strict=True))
     masked = torch.cat([srgb_from_linear(image).clamp_max(1) * alpha, alpha], 1)
     coded = code_cues(cues, alpha, coding)
-    tensors = (masked, coded, srgb_from_linear(target).clamp_max(1) * alpha, alpha, surface)
+    target = srgb_from_linear(target).clamp_max(1) * alpha
+    tensors = (masked, coded, target, alpha, surface, encode_cues(shading))
     return Batch(*(tensor.contiguous(memory_format=torch.channels_last) for tensor in tensors))
 
 
-def plain_example(item: TrainingItem, input_light: int, target_light: int, level: float = TRAINING_LEVEL) -> Example:
-    """No augmentation: one light to another, both exposed to the same diffuse level. For evaluation."""
+def plain_example(
+    item: TrainingItem,
+    input_light: int,
+    target_light: int,
+    level: float = TRAINING_LEVEL,
+    knows_shading: bool = False,
+) -> Example:
+    """No augmentation: one light to another, both exposed to the same diffuse level. For evaluation.
+
+    Args:
+        item: what is relit.
+        input_light, target_light: numbers of its lights.
+        level: mean diffuse cue.
+        knows_shading: whether the model is told the diffuse cue under the input light.
+    """
     alpha = item.alpha.float()
     cues = item.cues.float()
     gains = [level / diffuse_level(cues[light], alpha) for light in (input_light, target_light)]
     target = item.targets[target_light].float() * gains[1]
     image = item.targets[input_light].float() * gains[0]
-    return Example(image, cues[target_light] * gains[1], target, alpha, surface_of(item))
+    shading = cues[input_light, :3] * gains[0] * knows_shading
+    return Example(image, cues[target_light] * gains[1], target, alpha, surface_of(item), shading)
 
 
 def _example(
@@ -106,21 +132,68 @@ def _example(
     mixtures = [_mixture(order, config, generator), _mixture(order[::-1], config, generator)]
     is_composited = _uniform(generator) < config.composited_share
     surface = _random_surface(item, albedo_item, generator) if is_composited else surface_of(item)
-    images, cue_stacks = [], []
+    images, cue_stacks, gains = [], [], []
     for weights in mixtures:
         cues = _mixed(item.cues, weights.repeat(1, 4))
         target = composited(surface, cues) if is_composited else _mixed(item.targets, weights)
         gain = config.level / diffuse_level(cues, alpha)
         gain = gain * torch.exp(config.exposure * torch.randn((), generator=generator))
+        gains.append(gain)
         images.append((target * gain)[channels])
         cue_stacks.append((cues * gain).unflatten(0, (4, 3))[:, channels].flatten(0, 1))
     surface = torch.cat([surface[:3][channels], surface[3:]])
-    example = Example(images[0], cue_stacks[1], images[1], alpha, surface)
+    shading = torch.zeros_like(images[0])
+    if _uniform(generator) >= config.unknown_shading_share:
+        shading = gains[0] * _estimated_shading(item, mixtures[0], order[-1], alpha, config, generator)[channels]
+    cues = cue_stacks[1]
+    if config.dents > 0:
+        shading, cues = _dented(shading, cues, config.dents, generator)
+    example = Example(images[0], cues, images[1], alpha, surface, shading)
     is_mirrored, quarter_turns = _uniform(generator) < 0.5, 0
     if config.turns:
         quarter_turns = _integer(4, generator)
     turned = (torch.rot90(tensor, quarter_turns, (-2, -1)) for tensor in example)
     return Example(*(tensor.flip(-1) if is_mirrored else tensor for tensor in turned))
+
+
+def _estimated_shading(
+    item: TrainingItem,
+    mixture: Tensor,
+    wrong_light: int,
+    alpha: Float[Tensor, "1 height width"],
+    config: AugmentationConfig,
+    generator: torch.Generator,
+) -> Float[Tensor, "3 height width"]:
+    """The diffuse cue under an input light as an estimate of that light might give it; linear.
+
+    Wrong in direction (another light mixed in), contrast (a power about the mean), brightness and colour (gains).
+    """
+    error, mixture = config.shading_error, mixture.clone()
+    if _uniform(generator) < 0.7:
+        tint = torch.exp(config.tint * torch.randn(3, generator=generator))
+        mixture[wrong_light] += 0.6 * error * _uniform(generator) * mixture.sum(0).mean() * tint
+    shading = sum(item.cues[light, :3].float() * mixture[light][:, None, None] for light in range(len(mixture)))
+    assert isinstance(shading, Tensor)
+    mean = ((shading * alpha).sum((1, 2), keepdim=True) / alpha.sum().clamp_min(1e-3)).clamp_min(1e-4)
+    power = 1 + error * (0.45 * _uniform(generator) - 0.3)
+    gains = 0.2 * torch.randn((), generator=generator) + 0.15 * torch.randn(3, generator=generator)
+    return mean * (shading / mean).clamp_min(1e-4) ** power * torch.exp(error * gains)[:, None, None]
+
+
+def _dented(
+    shading: Float[Tensor, "3 height width"],
+    cues: Float[Tensor, "12 height width"],
+    largest: float,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "12 height width"]]:
+    """What dents in the mesh do to shading and cues, roughly: smooth noise on their logarithm, another per material."""
+    height, width = cues.shape[-2:]
+    pixels = 2 + _integer(5, generator)  # a dent's size
+    coarse = torch.randn(1, 5, -(-height // pixels) + 1, -(-width // pixels) + 1, generator=generator)
+    noise = functional.interpolate(coarse, (height, width), mode="bilinear", align_corners=True)[0]
+    spread = largest * _uniform(generator) * torch.tensor([1.0, 1.0, 3.0, 3.0, 3.0])
+    factors = torch.exp(spread[:, None, None] * noise)
+    return shading * factors[:1], (cues.unflatten(0, (4, 3)) * factors[1:, None]).flatten(0, 1)
 
 
 def composited_target(

@@ -5,7 +5,9 @@
 
 ConvNet 4 is the first convolution of the trainable copy of the UNet and lives there.
 Vocabulary: *masked image* = sRGB over black and the mask; *cues* = diffuse and three GGX lobes, RGB each, under the
-target light, coded (see `cue_coding`); *texture* = what multiplies the cues; *products* = texture * cues.
+target light, coded (see `cue_coding`); *shading* = the diffuse cue under the photograph's own light, coded, or zeros
+where nobody knows that light (Deviation: the paper has none; the embedded model takes it as a hint); *texture* = what
+multiplies the cues; *products* = texture * cues.
 """
 
 import math
@@ -17,8 +19,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from illuminerf.diffusion.cue_coding import encode_cues
+from illuminerf.scene.images import linear_from_srgb
+
 NUM_CUE_CHANNELS = 12
 NUM_IMAGE_CHANNELS = 4
+NUM_SHADING_CHANNELS = 3
+_USUAL_SHADING = 0.76  # coded: 0.55 in linear light, which training exposes a white object to
+_DARKEST_SHADING = 0.17  # coded
+_BRIGHTEST_UNLIT = 1.02
+_LEAST_COVERAGE = 0.05
 
 
 @dataclass(frozen=True)
@@ -48,11 +58,10 @@ class TextureConfig:
     patch: int = 1
     """Pixel-unshuffle before the first layer, undone after the last. Deviation: 1 in DiLightNet."""
     is_material: bool = False
-    """Deviation: decode with additive skips and one block per level, and read the texture as non-negative
-    offset + gain * image, so that it can be the albedo of each lobe in full detail (embedded model)."""
-    sees_cues: bool = False
-    """Deviation: the network sees the cues beside the image (DiLightNet's: the image alone). They show the shape,
-    without which paint and shading are hard to tell apart."""
+    """Deviation: the network sees the cues beside the image (they show the shape, without which paint and shading are
+    hard to tell apart) and the shading, decodes with additive skips and one block per level, and says the
+    texture as non-negative offset + gain * (image / shading), so that it can be the albedo of each lobe in full
+    detail (embedded model)."""
     num_attention: int = 0
     """Deviation: self-attention layers among the blocks at the lowest resolution (DiLightNet: none)."""
 
@@ -177,7 +186,8 @@ class TextureNetwork(nn.Module):
         super().__init__()
         self.config = config
         widths, patch = config.widths, config.patch
-        first = (NUM_IMAGE_CHANNELS + NUM_CUE_CHANNELS * config.sees_cues) * patch**2
+        seen = NUM_CUE_CHANNELS + 2 * NUM_SHADING_CHANNELS if config.is_material else 0
+        first = (NUM_IMAGE_CHANNELS + seen) * patch**2
         self.stem = nn.Conv2d(first, widths[0], 3, 1, 1) if patch == 1 else nn.Conv2d(first, widths[0], 1)
         self.downs = nn.ModuleList(
             nn.Sequential(nn.Conv2d(fine, coarse, 3, 2, 1), nn.GroupNorm(8, coarse), nn.SiLU())
@@ -194,14 +204,14 @@ class TextureNetwork(nn.Module):
         self.refines = nn.ModuleList(ResidualBlock(width) for width in widths[-2::-1] if config.is_material)
         self.out = nn.Conv2d(widths[0], num_maps * patch**2, 3 if patch == 1 else 1, 1, int(patch == 1))
         if config.is_material:
-            self._start_as_dim_copy()
+            self._start_as_unlit_image()
 
-    def _start_as_dim_copy(self) -> None:
-        """Before training: diffuse texture = 0.2 + 0.6 * image, gloss nearly none."""
+    def _start_as_unlit_image(self) -> None:
+        """Before training: a rough dielectric, diffuse texture = image / shading and 0.04 of the roughest lobe."""
         with torch.no_grad():
-            self.out.weight.mul_(0.1)
-            start = torch.full((2, NUM_CUE_CHANNELS), -0.3)
-            start[1], start[0, :3], start[1, :3] = 0.0, 0.2, 0.6
+            nn.init.zeros_(self.out.weight)
+            start = torch.zeros(2, NUM_CUE_CHANNELS)
+            start[0, 3:9], start[0, 9:] = -0.3, 0.208
             assert self.out.bias is not None
             self.out.bias.copy_(start.reshape(-1).repeat_interleave(self.config.patch**2))
 
@@ -209,10 +219,12 @@ class TextureNetwork(nn.Module):
         self,
         masked_image: Float[Tensor, "batch 4 height width"],
         coded_cues: Float[Tensor, "batch 12 height width"],
+        shading: Float[Tensor, "batch 3 height width"],
     ) -> Float[Tensor, "batch maps height width"]:
         """What the network itself gives: the texture, or a material's offsets and gains (24 maps)."""
-        patch = self.config.patch
-        seen = torch.cat([masked_image, coded_cues], 1) if self.config.sees_cues else masked_image
+        patch, seen = self.config.patch, masked_image
+        if self.config.is_material:
+            seen = torch.cat([masked_image, coded_cues, shading, unlit(masked_image, shading)], 1)
         features = functional.silu(self.stem(functional.pixel_unshuffle(seen, patch)))
         skips = []
         for down in self.downs:
@@ -229,20 +241,38 @@ class TextureNetwork(nn.Module):
         return functional.pixel_shuffle(self.out(features), patch)
 
     def texture(
-        self, maps: Float[Tensor, "batch maps height width"], rgb: Float[Tensor, "batch 3 height width"]
+        self,
+        maps: Float[Tensor, "batch maps height width"],
+        masked_image: Float[Tensor, "batch 4 height width"],
+        shading: Float[Tensor, "batch 3 height width"],
     ) -> Float[Tensor, "batch 12 height width"]:
-        """The texture from the maps and the image; both may be larger than the network's own input."""
+        """The texture from the maps, the image and its shading; all may be larger than the network's own input."""
         if not self.config.is_material:
             return maps
-        offset, gain = maps.chunk(2, 1)
-        return functional.softplus(offset + gain * rgb.repeat(1, NUM_CUE_CHANNELS // 3, 1, 1), beta=8.0)
+        albedo = unlit(masked_image, shading)
+        offset, gain = maps.float().chunk(2, 1)
+        diffuse = offset[:, :3] + gain[:, :3].clamp(-3, 3).exp() * albedo
+        specular = offset[:, 3:] + gain[:, 3:] * albedo.repeat(1, NUM_CUE_CHANNELS // 3 - 1, 1, 1)
+        return torch.cat([functional.softplus(diffuse, beta=16.0), functional.softplus(specular, beta=8.0)], 1)
 
     def forward(
         self,
         masked_image: Float[Tensor, "batch 4 height width"],
         coded_cues: Float[Tensor, "batch 12 height width"],
+        shading: Float[Tensor, "batch 3 height width"],
     ) -> Float[Tensor, "batch 12 height width"]:
-        return self.texture(self.maps(masked_image, coded_cues), masked_image[:, :3])
+        return self.texture(self.maps(masked_image, coded_cues, shading), masked_image, shading)
+
+
+def unlit(
+    masked_image: Float[Tensor, "batch 4 height width"], shading: Float[Tensor, "batch 3 height width"]
+) -> Float[Tensor, "batch 3 height width"]:
+    """The straight image divided by its shading, which is the albedo of a matt object, coded as cues are; where the
+    shading is unknown (all zeros), divided by the usual one."""
+    straight = (masked_image[:, :3] / masked_image[:, 3:].clamp_min(_LEAST_COVERAGE)).clamp(0, 1)
+    is_known = (shading.amax((1, 2, 3), keepdim=True) > 0).to(shading)
+    divisor = shading.clamp_min(_DARKEST_SHADING) * is_known + _USUAL_SHADING * (1 - is_known)
+    return (encode_cues(linear_from_srgb(straight)) / divisor).clamp_max(_BRIGHTEST_UNLIT)
 
 
 class Conditioning(nn.Module):
@@ -260,6 +290,7 @@ class Conditioning(nn.Module):
         masked_image: Float[Tensor, "batch 4 height width"],
         coded_cues: Float[Tensor, "batch 12 height width"],
         text: Float[Tensor, "text_length channels"] | None = None,
+        shading: Float[Tensor, "batch 3 height width"] | None = None,
     ) -> Condition:
         """Run ConvNets 1 to 3.
 
@@ -267,9 +298,12 @@ class Conditioning(nn.Module):
             masked_image: sRGB over black in [0, 1], then the mask.
             coded_cues: as the model's cue coding gives them.
             text: what the control hears where there is no ConvNet 1.
+            shading: the coded diffuse cue under the photograph's own light; left out or zeros: unknown.
         """
-        maps = self.texture.maps(masked_image, coded_cues)
-        products = self.texture.texture(maps, masked_image[:, :3]) * coded_cues
+        if shading is None:
+            shading = torch.zeros_like(masked_image[:, :NUM_SHADING_CHANNELS])
+        maps = self.texture.maps(masked_image, coded_cues, shading)
+        products = self.texture.texture(maps, masked_image, shading) * coded_cues
         if self.tokens is not None:
             tokens = padded_tokens(self.tokens(masked_image), self.config.text_length)
         elif text is not None:

@@ -117,8 +117,9 @@ class ControlledBase(nn.Module):
         self,
         masked_image: Float[Tensor, "batch 4 height width"],
         coded_cues: Float[Tensor, "batch 12 height width"],
+        shading: Float[Tensor, "batch 3 height width"] | None = None,
     ) -> Condition:
-        """ConvNets 1 to 3, once per image."""
+        """ConvNets 1 to 3, once per image; the paper's ConvNet 2 takes no hint, so `shading` changes nothing."""
         return self.conditioning(masked_image, coded_cues, self.base.empty_text)
 
     def anchor(

@@ -30,7 +30,9 @@ def code_cues(
     return (srgb_from_linear(linear_cues.clamp(0.0, 1.0)) * 255).round() / 255 * alpha
 
 
-def encode_cues(linear_cues: Float[Tensor, "*batch 12 height width"]) -> Float[Tensor, "*batch 12 height width"]:
+def encode_cues(
+    linear_cues: Float[Tensor, "*batch channels height width"],
+) -> Float[Tensor, "*batch channels height width"]:
     """Straight linear radiance to power-coded values in [0, 3.53]: min(x, 16)^(1/2.2).
 
     Deviation: the paper does not say how it codes cues; DiLightNet feeds 8-bit sRGB, clipped at 1.

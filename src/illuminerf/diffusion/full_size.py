@@ -4,7 +4,7 @@ The object is cut out as a square, as in the training renders, brought to the mo
 becomes an image of the photograph's size is the model's own affair (`Relighter.at_full_size`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional
 
-from illuminerf.diffusion.cue_coding import code_cues
+from illuminerf.diffusion.cue_coding import code_cues, encode_cues
 from illuminerf.diffusion.relighter import Piece, Relighter
 from illuminerf.diffusion.resizing import resized
 from illuminerf.diffusion.sampling import Sampler, sample_decoded
@@ -30,15 +30,17 @@ class Photograph:
     Attributes:
         masked_image: [4, height, width], sRGB over black in [0, 1], then alpha.
         linear_cues: [12, height, width], straight linear radiance under the target light.
+        linear_shading: [3, height, width], straight diffuse cue under the photograph's own light; zeros: unknown.
     """
 
     masked_image: Tensor
     linear_cues: Tensor
+    linear_shading: Tensor
 
 
 def straight_cues(
-    premultiplied: Float[np.ndarray, "12 height width"], coverage: Float[np.ndarray, "height width"]
-) -> Float[np.ndarray, "12 height width"]:
+    premultiplied: Float[np.ndarray, "channels height width"], coverage: Float[np.ndarray, "height width"]
+) -> Float[np.ndarray, "channels height width"]:
     """Divide by the mesh's coverage; where the mesh misses the object, repeat the nearest covered pixel."""
     covered = coverage > _LEAST_COVERAGE
     if not covered.any():
@@ -101,24 +103,20 @@ def relight_photographs(
         exposure: the model sees the cues times this factor, and what it says is divided by it in linear light: models
             are at their best where the target light is about as bright as those that they were trained under.
     """
-    photographs = [Photograph(p.masked_image, p.linear_cues * exposure) for p in photographs]
+    photographs = [replace(p, linear_cues=p.linear_cues * exposure) for p in photographs]
     size = model.image_size
     squares = [object_square(photograph.masked_image[3]) for photograph in photographs]
     images = [cut_out(p.masked_image, square) for p, square in zip(photographs, squares, strict=True)]
-    covered_cues = [
-        cut_out(p.linear_cues * p.masked_image[3], square) for p, square in zip(photographs, squares, strict=True)
-    ]
     masked = torch.cat([resized(image[None], size) for image in images])
-    alpha = masked[:, 3:].clamp_min(_LEAST_COVERAGE)
-    cues = torch.cat([resized(cues[None], size) for cues in covered_cues]) / alpha
-    coded = code_cues(cues * (masked[:, 3:] > _LEAST_COVERAGE), masked[:, 3:], model.cue_coding)
-    masked = masked.contiguous(memory_format=torch.channels_last)
-    coded = coded.contiguous(memory_format=torch.channels_last)
-
-    condition = model.condition(masked, coded)
+    pairs = list(zip(photographs, squares, strict=True))
+    cues = _brought_to(size, [(p.linear_cues, p.masked_image[3], square) for p, square in pairs], masked)
+    shading = _brought_to(size, [(p.linear_shading, p.masked_image[3], square) for p, square in pairs], masked)
+    coded = code_cues(cues, masked[:, 3:], model.cue_coding)
+    inputs = (t.contiguous(memory_format=torch.channels_last) for t in (masked, coded, encode_cues(shading)))
+    condition = model.condition(*inputs)
     decoded = sample_decoded(model, condition, seeds, num_steps, sampler, temperature, samples_at_once)
     pieces = [
-        Piece(image, cut_out(p.linear_cues, square))
+        Piece(image, cut_out(p.linear_cues, square), cut_out(p.linear_shading, square))
         for p, image, square in zip(photographs, images, squares, strict=True)
     ]
     results = []
@@ -132,3 +130,14 @@ def relight_photographs(
         relit = torch.minimum(relit.clamp_min(0), coverage)
         results.append(torch.stack([put_back(image, squares[index], height, width) for image in relit]))
     return results
+
+
+def _brought_to(
+    size: int, radiance: list[tuple[Tensor, Tensor, tuple[int, int, int]]], masked: Tensor
+) -> Float[Tensor, "batch channels size size"]:
+    """Cut (straight radiance, coverage, square) out and average it over what is covered: straight again."""
+    covered = torch.cat(
+        [resized(cut_out(image * coverage, square)[None], size) for image, coverage, square in radiance]
+    )
+    alpha = masked[:, 3:]
+    return covered / alpha.clamp_min(_LEAST_COVERAGE) * (alpha > _LEAST_COVERAGE)

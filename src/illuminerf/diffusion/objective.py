@@ -35,6 +35,8 @@ class Batch(NamedTuple):
     alpha: Float[Tensor, "batch 1 height width"]
     surface: Float[Tensor, "batch 5 height width"]
     """What the object is made of: linear base colour, metallicity, roughness."""
+    shading: Float[Tensor, "batch 3 height width"]
+    """Coded diffuse cue under the input light; zeros where it is unknown."""
 
 
 class Draws(NamedTuple):
@@ -83,12 +85,12 @@ def latent_weight(alpha: Float[Tensor, "batch 1 height width"], block: int, outs
 class LossWeights:
     """How the terms are added."""
 
-    anchor: float = 5.0
+    anchor: float = 1.0
     """Squared sRGB error of the composited products, per covered pixel."""
-    rescaled_anchor: float = 0.3
+    rescaled_anchor: float = 1.0
     """Logarithm of each image's mean squared error after the least-squares gain per image and channel, which is what
     PSNR averages: a single image cannot tell albedo from exposure, and easy images count as much as hard ones."""
-    materials: float = 2.0
+    materials: float = 0.5
     """Squared error of ConvNet 2's texture against what the object's true materials say, after the same gain, summed
     over the lobes, per covered pixel and colour. Renders know their materials; the paper's loss does not use them."""
     diffusion: float = 1.0
@@ -169,7 +171,7 @@ def training_loss(
 ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
     """What these examples add to the step's loss, and to its parts; `scale_momentum` > 0 also lets the latent scales
     follow the data."""
-    condition = model.condition(batch.masked_image, batch.coded_cues)
+    condition = model.condition(batch.masked_image, batch.coded_cues, batch.shading)
     loss = torch.zeros((), device=batch.target.device)
     parts: dict[str, Tensor] = {}
     if model.config.latent_is_residual:
@@ -180,7 +182,7 @@ def training_loss(
             gain = best_gain(condition.products, batch)
             rescaled = relative_loss(condition.products * gain, batch) / totals.examples
             loss, parts["rescaled"] = loss + weights.rescaled_anchor * rescaled, rescaled.detach()
-            texture = model.conditioning.texture.texture(condition.maps, batch.masked_image[:, :3])
+            texture = model.conditioning.texture.texture(condition.maps, batch.masked_image, batch.shading)
             materials = materials_loss(texture * gain, batch, totals.covered)
             loss, parts["materials"] = loss + weights.materials * materials, materials.detach()
     if weights.diffusion > 0:
@@ -225,7 +227,7 @@ def control_loss(model: ControlledBase, batch: Batch, draws: Draws, totals: Tota
     timesteps = draws.timesteps.to(latent.device)
     schedule = model.noise_schedule()
     signal, sigma = signal_and_noise(timesteps, schedule)
-    condition = model.condition(batch.masked_image, batch.coded_cues)
+    condition = model.condition(batch.masked_image, batch.coded_cues, batch.shading)
     predicted = model(signal * latent + sigma * noise, timesteps, condition).float()
     predicts_noise = schedule.config.prediction_type == "epsilon"
     wanted = noise if predicts_noise else signal * noise - sigma * latent

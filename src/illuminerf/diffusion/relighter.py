@@ -21,6 +21,8 @@ class Piece(NamedTuple):
     """sRGB over black in [0, 1], then alpha."""
     linear_cues: Float[Tensor, "12 side side"]
     """Straight linear radiance under the target light."""
+    linear_shading: Float[Tensor, "3 side side"]
+    """Straight diffuse cue under the photograph's own light; zeros: unknown."""
 
 
 @runtime_checkable
@@ -53,8 +55,9 @@ class Relighter(Protocol):
         self,
         masked_image: Float[Tensor, "batch 4 height width"],
         coded_cues: Float[Tensor, "batch 12 height width"],
+        shading: Float[Tensor, "batch 3 height width"] | None = None,
     ) -> Condition:
-        """What is computed once per image."""
+        """What is computed once per image; `shading` (see `conditioning`) is a hint that a model need not take."""
 
     def anchor(
         self, condition: Condition, alpha: Float[Tensor, "batch 1 height width"]

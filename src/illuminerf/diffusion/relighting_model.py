@@ -70,9 +70,7 @@ class RelightingModelConfig:
     conditioning: ConditioningConfig = field(
         default=ConditioningConfig(
             tokens=PyramidConfig(widths=(32, 48, 64), out_channels=96, patch=4),
-            texture=TextureConfig(
-                widths=(96, 192, 320), num_blocks=4, patch=4, is_material=True, sees_cues=True, num_attention=2
-            ),
+            texture=TextureConfig(widths=(96, 192, 320), num_blocks=4, patch=4, is_material=True, num_attention=2),
             embedding=PyramidConfig(widths=(32, 48), out_channels=48, patch=4),
         )
     )
@@ -145,9 +143,10 @@ class RelightingModel(nn.Module):
         self,
         masked_image: Float[Tensor, "batch 4 height width"],
         coded_cues: Float[Tensor, "batch 12 height width"],
+        shading: Float[Tensor, "batch 3 height width"] | None = None,
     ) -> Condition:
         """ConvNets 1 to 3, once per image."""
-        return self.conditioning(masked_image, coded_cues)
+        return self.conditioning(masked_image, coded_cues, shading=shading)
 
     def anchor(
         self, condition: Condition, alpha: Float[Tensor, "batch 1 height width"]
@@ -168,15 +167,16 @@ class RelightingModel(nn.Module):
         pieces: list[Piece],
     ) -> list[Float[Tensor, "samples 3 side side"]]:
         """Detail comes back the way it went in: the material maps (offsets and gains on the image) and the sampled
-        residual are smooth and are enlarged; photograph and cues, which carry the detail, are used at full size."""
+        residual are smooth and are enlarged; photograph, cues and shading, which carry the detail, are used at full
+        size."""
         results = []
         for index, piece in enumerate(pieces):
             image, side = piece.masked_image[None], piece.masked_image.shape[-1]
             relit = resized(decoded[index], side)
             if self.config.latent_is_residual:
-                texture = self.conditioning.texture.texture(
-                    resized(condition.maps[index : index + 1], side), image[:, :3]
-                )
+                maps = resized(condition.maps[index : index + 1], side)
+                shading = encode_cues(piece.linear_shading[None])
+                texture = self.conditioning.texture.texture(maps, image, shading)
                 products = texture * encode_cues(piece.linear_cues[None])
                 composite = composited_srgb(products)
                 relit = relit + composite.clamp_max(1) * image[:, 3:]

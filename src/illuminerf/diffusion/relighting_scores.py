@@ -94,16 +94,18 @@ def evaluate(
     sampler: Sampler = "ddim",
     batch_size: int = 8,
     temperature: float = 1.0,
+    knows_shading: bool = False,
 ) -> tuple[dict[str, dict[str, float]], dict[str, Float[Tensor, "pairs 3 height width"]]]:
     """Scores by estimate ({name: {psnr, ssim}}), and the images, on held-out items.
 
     Estimates: input (the image itself), mean_albedo (its mean albedo * diffuse cue), anchor (products alone, of
     models that have one), sample (one sample, averaged), mean (mean of samples), best (best sample), bound (true
     materials).
+    `knows_shading` tells the model the diffuse cue under the input light, which single photographs come without.
     `spread` is the samples' standard deviation over covered pixels, in sRGB.
     """
     pairs = held_out_pairs(items, num_pairs)
-    examples = [plain_example(*pair) for pair in pairs]
+    examples = [plain_example(*pair, knows_shading=knows_shading) for pair in pairs]
     batch = stack_examples(examples, model.cue_coding)
     linear_cues = torch.stack([example.cues for example in examples])
     diffuse_cues = encode_cues(linear_cues)[:, :3]
@@ -111,10 +113,11 @@ def evaluate(
     for start in range(0, len(pairs), batch_size):
         rows = slice(start, start + batch_size)
         image, cues = batch.masked_image[rows].to(model.device), batch.coded_cues[rows].to(model.device)
+        shading = batch.shading[rows].to(model.device)
         seeds = [[1000 * (start + i) + k for k in range(num_samples)] for i in range(len(image))]
-        samples.append(sample_relit(model, image, cues, seeds, num_steps, sampler, temperature).cpu())
+        samples.append(sample_relit(model, image, cues, seeds, num_steps, sampler, temperature, 0, shading).cpu())
         if model.latent_is_residual:
-            anchors.append(model.anchor(model.condition(image, cues), image[:, 3:]).float().cpu())
+            anchors.append(model.anchor(model.condition(image, cues, shading), image[:, 3:]).float().cpu())
     drawn = torch.cat(samples)
     bound = composited(batch.surface, linear_cues)
     images = {

@@ -95,6 +95,7 @@ def sample_relit(
     sampler: Sampler = "ddim",
     temperature: float = 1.0,
     samples_at_once: int = 0,
+    shading: Float[Tensor, "batch 3 height width"] | None = None,
 ) -> Float[Tensor, "batch samples 3 height width"]:
     """Draw relit images: sRGB over black in [0, 1].
 
@@ -107,8 +108,9 @@ def sample_relit(
         sampler: the scheduler.
         temperature: factor on the initial noise; below 1 samples stay nearer to their mean (not in the paper).
         samples_at_once: samples per image in one batch, to save memory; 0: all.
+        shading: coded diffuse cue under the image's own light; left out or zeros: unknown.
     """
-    condition = model.condition(masked_image, coded_cues)
+    condition = model.condition(masked_image, coded_cues, shading)
     decoded = sample_decoded(model, condition, seeds, num_steps, sampler, temperature, samples_at_once)
     if model.latent_is_residual:
         relit = decoded + model.anchor(condition, masked_image[:, 3:])[:, None]

@@ -68,9 +68,10 @@ class Config:
     control: ControlledBaseConfig = field(default=ControlledBaseConfig())
     """Where its `base` is named, the paper's kind is trained instead: a control on that frozen base."""
     phases: tuple[Phase, ...] = (
-        Phase(2500, 64, "products"),
-        Phase(500, 128, "products"),
-        Phase(700, 128),
+        Phase(1800, 64, "products"),
+        Phase(700, 128, "products"),
+        Phase(1500, 64, "diffusion"),
+        Phase(900, 128),
     )
     """In order. Deviation: the paper trains 150,000 steps at one resolution."""
     batch_size: int = 32
@@ -121,7 +122,9 @@ class Config:
             warm_up_steps=1000,
             final_share=0.0,
             average_decay=0.9999,
-            augmentation=AugmentationConfig(composited_share=0.0, mixture_share=0.0, tint=0.0, exposure=0.0),
+            augmentation=AugmentationConfig(
+                composited_share=0.0, mixture_share=0.0, tint=0.0, exposure=0.0, unknown_shading_share=1.0, dents=0.0
+            ),
             execution=ExecutionConfig(precision="bfloat16", num_threads=8, checkpoints_gradients=True),
             checkpoint_seconds=1800.0,
         )

@@ -1,5 +1,8 @@
 """Capture + radiance cues + relighting model -> S relit samples of every view (paper, section 3.3).
 
+Where an Illumination artefact is given, the embedded model also sees what the photographs' own light does to a white
+object (Deviation: the paper's model has to guess that from each photograph alone).
+
 samples/<000>_<00>.png   sRGB over black (premultiplied by the capture's alpha), at the capture's size
 seeds.json               the seed of every sample
 
@@ -8,11 +11,14 @@ Whoever finds every sample in place seals the artefact.
 """
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from illuminerf.cues.renderer import CUE_CHANNELS
 from illuminerf.data.capture import load_capture
@@ -23,6 +29,7 @@ from illuminerf.diffusion.relighter import Relighter
 from illuminerf.diffusion.sampling import Sampler
 from illuminerf.scene.images import read_exr, write_png
 from illuminerf.scene.views import Views
+from illuminerf.stages.estimate_illumination import shading_path
 from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.device import Precision, autocast, derived_seed, resolve_device
@@ -70,13 +77,14 @@ class Config:
             raise UserError("at most 100 samples and 1000 steps")
 
 
-def run(capture: Path, cues: Path, model: Path | str, config: Config, out: Path) -> Path:
+def run(capture: Path, cues: Path, model: Path | str, illumination: Path | None, config: Config, out: Path) -> Path:
     """Relight every view of `capture` into `out`; samples that exist are kept.
 
     Args:
         capture: a Capture artefact.
         cues: a RadianceCues artefact of the same views.
         model: a RelightingModel folder, "embedded" for the one inside the package, or "dilightnet" once downloaded.
+        illumination: an Illumination artefact of the same views, or None.
         config: the settings.
         out: the artefact's folder.
 
@@ -86,6 +94,8 @@ def run(capture: Path, cues: Path, model: Path | str, config: Config, out: Path)
     folder = model_folder(model)
     shard, num_shards = shard_of(config.shard)
     inputs: dict[str, Path | str] = {"capture": capture, "cues": cues, "model": folder}
+    if illumination is not None:
+        inputs["illumination"] = illumination
     keyed = replace(config, shard="")
     with open_artefact(out, STAGE, keyed, inputs, is_shared=num_shards > 1) as artefact:
         if artefact.is_done:
@@ -101,7 +111,8 @@ def run(capture: Path, cues: Path, model: Path | str, config: Config, out: Path)
         ours = batches[shard::num_shards]
         todo = [batch for batch in ours if not _is_relit(out, batch, config.num_samples)]
         if todo:
-            _relight_all(folder, views, cues, ours, todo, seeds, config, out)
+            sources = _Sources(views, cues, illumination)
+            _relight_all(folder, sources, ours, todo, seeds, config, out)
         if _is_relit(out, list(seeds), config.num_samples):
             artefact.finish({"num_views": len(views), "num_samples": config.num_samples})
         else:
@@ -118,10 +129,17 @@ def _is_relit(out: Path, batch: list[int], num_samples: int) -> bool:
     return all(sample_path(out, view, k).exists() for view in batch for k in range(num_samples))
 
 
+class _Sources(NamedTuple):
+    """Where a view's pixels come from."""
+
+    views: Views
+    cues: Path
+    illumination: Path | None
+
+
 def _relight_all(
     folder: Path,
-    views: Views,
-    cues: Path,
+    sources: _Sources,
     ours: list[list[int]],
     todo: list[list[int]],
     seeds: dict[int, list[int]],
@@ -132,26 +150,25 @@ def _relight_all(
     if device == torch.device("cuda"):  # under a launcher each process has a GPU of its own
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
     network = pretrained_model(folder, device)
-    exposure = exposure_for(views, cues)
+    exposure = exposure_for(sources.views, sources.cues)
     num_views = sum(map(len, ours))
     with step_progress("relight views", num_views, num_views - sum(map(len, todo))) as progress:
         for batch in todo:
             with autocast(device, config.precision):
-                _relight(network, views, cues, batch, [seeds[view] for view in batch], config, out, exposure)
+                _relight(network, sources, batch, [seeds[view] for view in batch], config, out, exposure)
             progress.advance(len(batch))
 
 
 def _relight(
     network: Relighter,
-    views: Views,
-    cues: Path,
+    sources: _Sources,
     batch: list[int],
     seeds: list[list[int]],
     config: Config,
     out: Path,
     exposure: float,
 ) -> None:
-    photographs = [_photograph(views, view, cues, network.device) for view in batch]
+    photographs = [_photograph(sources, view, network.device) for view in batch]
     relit = relight_photographs(
         network,
         photographs,
@@ -180,23 +197,31 @@ def exposure_for(views: Views, cues: Path) -> float:
     return TRAINING_LEVEL / level if level > _DARK else 1.0
 
 
-def _photograph(views: Views, view: int, cues: Path, device: torch.device) -> Photograph:
-    path = Path(cues) / "cues" / f"{view:03d}.exr"
+def _photograph(sources: _Sources, view: int, device: torch.device) -> Photograph:
+    alpha = sources.views.alpha[view]
+    cues = _straight(sources.cues / "cues" / f"{view:03d}.exr", CUE_CHANNELS, alpha.shape)
+    shading = np.zeros((3, *alpha.shape), np.float32)
+    if sources.illumination is not None:
+        shading = _straight(shading_path(sources.illumination, view), "RGB", alpha.shape)
+    masked = np.concatenate([sources.views.srgb[view] * alpha[..., None], alpha[..., None]], -1)
+    return Photograph(
+        torch.from_numpy(np.ascontiguousarray(masked.transpose(2, 0, 1))).float().to(device),
+        torch.from_numpy(cues).float().to(device),
+        torch.from_numpy(shading).float().to(device),
+    )
+
+
+def _straight(path: Path, names: Sequence[str], shape: tuple[int, ...]) -> Float[np.ndarray, "channels height width"]:
+    """Premultiplied channels of an EXR file that also has the mesh's coverage, `A`, as straight ones."""
     channels = read_exr(path)
-    missing = [name for name in (*CUE_CHANNELS, "A") if name not in channels]
+    missing = [name for name in (*names, "A") if name not in channels]
     if missing:
-        raise UserError(f"{path} lacks the channel '{missing[0]}'", fix="render the radiance cues again")
-    alpha = views.alpha[view]
-    if channels["A"].shape != alpha.shape:
+        raise UserError(f"{path} lacks the channel '{missing[0]}'", fix="delete its folder and make it again")
+    if channels["A"].shape != shape:
         raise UserError(
             f"{path} does not fit the capture",
             got=str(channels["A"].shape),
-            wanted=str(alpha.shape),
-            fix="render the radiance cues from this capture",
+            wanted=str(shape),
+            fix="make it from this capture",
         )
-    straight = straight_cues(np.stack([channels[name] for name in CUE_CHANNELS]), channels["A"])
-    masked = np.concatenate([views.srgb[view] * alpha[..., None], alpha[..., None]], -1)
-    return Photograph(
-        torch.from_numpy(np.ascontiguousarray(masked.transpose(2, 0, 1))).float().to(device),
-        torch.from_numpy(straight).float().to(device),
-    )
+    return straight_cues(np.stack([channels[name] for name in names]), channels["A"])
