@@ -17,6 +17,7 @@ from illuminerf.presets import PRESETS, Preset, customised
 from illuminerf.scene.example_assets import write_example_assets
 from illuminerf.stages import (
     estimate_geometry,
+    estimate_illumination,
     evaluate_relighting,
     fit_latent_nerf,
     import_capture,
@@ -204,6 +205,12 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     ),
     "estimate-geometry": _stage(
         estimate_geometry.run, estimate_geometry.Config, "Fit the surface field to a capture.", {"capture": Path}
+    ),
+    "estimate-illumination": _stage(
+        estimate_illumination.run,
+        estimate_illumination.Config,
+        "Estimate the photographs' own light from geometry and photographs, and path trace its diffuse shading.",
+        {"geometry": Path, "capture": Path},
     ),
     "render-radiance-cues": _stage(
         render_radiance_cues.run,

@@ -197,6 +197,13 @@ def test_diffuse_is_flat_and_specular_is_smooth() -> None:
     assert levels_diffuse < levels_rough
 
 
+def test_the_diffuse_cue_alone_is_that_of_the_stack(sphere: TriangleMesh) -> None:
+    view, light, sampling = camera((3, 0, 0)), lamp((1, 0, 1)), CueSampling(4)
+    alone = next(render_cues(sphere, view, light, sampling, 7, only_diffuse=True))
+    stack = next(render_cues(sphere, view, light, sampling, 7))
+    np.testing.assert_array_equal(alone, stack[[0, 1, 2, 12]])
+
+
 def test_channels_and_settings() -> None:
     assert len(CUE_CHANNELS) == 12 and CUE_CHANNELS[3] == "ggx_005.R"
     with pytest.raises(UserError, match="samples_per_pixel"):

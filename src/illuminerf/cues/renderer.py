@@ -61,38 +61,47 @@ class MitsubaCueRenderer:
         mesh: the object in the world of the cameras.
         light: the first light; its resolution is that of all later ones.
         sampling: paths and bounces.
+        only_diffuse: leave the specular materials out.
     """
 
-    def __init__(self, mesh: TriangleMesh, light: EnvironmentMap, sampling: CueSampling) -> None:
+    def __init__(
+        self, mesh: TriangleMesh, light: EnvironmentMap, sampling: CueSampling, only_diffuse: bool = False
+    ) -> None:
         mi = load_mitsuba(sampling.device)
         self.sampling = sampling
         white: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
         conductor = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": 0.1}
         # Hybrid shading normals (paper, supplement "Shading Normals"): faces for diffuse, smooth for specular.
         flat = mitsuba_mesh(mi, "flat", mesh.vertices, mesh.faces, _two_sided(white))
-        smooth = mitsuba_mesh(
-            mi, "smooth", mesh.vertices, mesh.faces, _two_sided(conductor), vertex_normals=mesh.vertex_normals
-        )
         self._diffuse = MitsubaScene({"mesh": flat}, light, sampling.device)
-        self._specular = MitsubaScene({"mesh": smooth}, light, sampling.device)
-        self._alpha_name = next(n for n in self._specular.parameters.keys() if n.endswith("alpha.value"))  # noqa: SIM118
+        self._specular: MitsubaScene | None = None
+        if not only_diffuse:
+            smooth = mitsuba_mesh(
+                mi, "smooth", mesh.vertices, mesh.faces, _two_sided(conductor), vertex_normals=mesh.vertex_normals
+            )
+            self._specular = MitsubaScene({"mesh": smooth}, light, sampling.device)
+            names = self._specular.parameters.keys()
+            self._alpha_name = next(name for name in names if name.endswith("alpha.value"))
         self._light: EnvironmentMap | None = None
 
     def render(self, cameras: Cameras, view: int, light: EnvironmentMap, seed: int) -> np.ndarray:
-        """Cues of one view: float32 [13, height, width], `CUE_CHANNELS` linear premultiplied, then coverage."""
+        """Cues of one view: float32 [13, height, width], `CUE_CHANNELS` linear premultiplied, then coverage; or
+        [4, height, width], those of the diffuse material alone."""
         if light is not self._light:
-            self._diffuse.set_light(light)
-            self._specular.set_light(light)
+            for scene in (self._diffuse, self._specular):
+                if scene is not None:
+                    scene.set_light(light)
             self._light = light
         spp, settings = self.sampling.samples_per_pixel, self.sampling
         diffuse = self._diffuse.render(cameras, view, settings.diffuse_depth, spp, derived_seed(seed, "diffuse"))
         layers = [diffuse[..., :3]]
-        for roughness in CUE_ROUGHNESS:
-            self._specular.set_values(**{self._alpha_name.replace(".", "__"): roughness**2})
-            image = self._specular.render(
-                cameras, view, settings.specular_depth, spp, derived_seed(seed, "specular", roughness)
-            )
-            layers.append(image[..., :3])
+        if self._specular is not None:
+            for roughness in CUE_ROUGHNESS:
+                self._specular.set_values(**{self._alpha_name.replace(".", "__"): roughness**2})
+                image = self._specular.render(
+                    cameras, view, settings.specular_depth, spp, derived_seed(seed, "specular", roughness)
+                )
+                layers.append(image[..., :3])
         layers.append(np.clip(diffuse[..., 3:4], 0, 1))
         return np.ascontiguousarray(np.concatenate(layers, -1).transpose(2, 0, 1))
 
@@ -108,6 +117,7 @@ def render_cues(
     sampling: CueSampling,
     seed: int,
     views: list[int] | None = None,
+    only_diffuse: bool = False,
 ) -> Iterator[np.ndarray]:
     """Radiance cues of a mesh, view by view.
 
@@ -118,10 +128,12 @@ def render_cues(
         sampling: paths and bounces.
         seed: each view's own seed is derived from it and the view's index, so views do not depend on each other.
         views: which views, default all.
+        only_diffuse: leave the specular materials out.
 
     Yields:
-        float32 [13, height, width] per view: `CUE_CHANNELS`, linear and premultiplied, then coverage.
+        float32 [13, height, width] per view: `CUE_CHANNELS`, linear and premultiplied, then coverage; with
+        `only_diffuse` [4, height, width], the same values of the diffuse material.
     """
-    renderer = MitsubaCueRenderer(mesh, light, sampling)
+    renderer = MitsubaCueRenderer(mesh, light, sampling, only_diffuse)
     for view in range(len(cameras)) if views is None else views:
         yield renderer.render(cameras, view, light, derived_seed(seed, "view", view))

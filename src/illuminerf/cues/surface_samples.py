@@ -1,0 +1,235 @@
+"""Points on a mesh: the colours that photographs show there, and how much light reaches them from every direction."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from illuminerf.cues.mitsuba_scene import mitsuba_mesh
+from illuminerf.cues.mitsuba_variant import load_mitsuba
+from illuminerf.scene.environment import EnvironmentMap
+from illuminerf.scene.images import linear_from_srgb
+from illuminerf.scene.meshes import TriangleMesh
+from illuminerf.scene.views import Views
+from illuminerf.workflow.errors import UserError
+
+_RAYS_PER_PASS = 2**20
+_OFFSET = 4e-3  # of the unit ball: rays start this far above the surface, beyond its dents
+_LEAST_COSINE = 0.2  # photographs that see a point at a flatter angle are not asked
+_OPAQUE = 0.98
+_CLIPPED_SRGB = 0.985
+
+
+class OcclusionTest:
+    """Whether rays hit a mesh.
+
+    Args:
+        mesh: the object.
+        device: auto, cpu or cuda.
+    """
+
+    def __init__(self, mesh: TriangleMesh, device: str = "auto") -> None:
+        self._mitsuba = load_mitsuba(device)
+        shape = mitsuba_mesh(self._mitsuba, "mesh", mesh.vertices, mesh.faces, {"type": "diffuse"})
+        self._scene: Any = self._mitsuba.load_dict({"type": "scene", "mesh": shape})
+
+    def is_blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Bool [rays] for rays that never end, float [rays, 3] each; directions are unit."""
+        mi, is_scalar = self._mitsuba, self._mitsuba.variant().startswith("scalar")
+        blocked = np.zeros(len(origins), bool)
+        for first in range(0, len(origins), _RAYS_PER_PASS):
+            part = slice(first, first + _RAYS_PER_PASS)
+            starts, toward = (np.ascontiguousarray(a[part], np.float32) for a in (origins, directions))
+            if is_scalar:
+                rays = (
+                    mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
+                    for o, d in zip(starts.tolist(), toward.tolist(), strict=True)
+                )
+                blocked[part] = [self._scene.ray_test(ray) for ray in rays]
+            else:
+                ray = mi.Ray3f(mi.Point3f(*starts.T), mi.Vector3f(*toward.T))
+                blocked[part] = np.array(self._scene.ray_test(ray))
+        return blocked
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points on a mesh.
+
+    Attributes:
+        positions: float32 [points, 3], world.
+        normals: float32 [points, 3], unit, outward.
+    """
+
+    positions: np.ndarray
+    normals: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __getitem__(self, index: np.ndarray) -> "SurfacePoints":
+        return SurfacePoints(self.positions[index], self.normals[index])
+
+
+@dataclass(frozen=True)
+class ColorGathering:
+    """Which points of a mesh are looked at, and how their colours are read from photographs."""
+
+    num_points: int = 6000
+    """Points to keep."""
+    candidates_per_point: int = 3
+    """Points drawn for every one to keep; those that photographs do not show well are dropped."""
+    normal_radius: float = 0.03
+    """Normals are averaged over faces within this distance, in radii of the unit ball, which irons out dents."""
+    quantile: float = 0.25
+    """Which of the colours that a point shows in different photographs counts; low ones leave highlights out."""
+    least_views: int = 2
+    """Photographs that must show a point (all of them, where there are fewer)."""
+
+    def __post_init__(self) -> None:
+        if min(self.num_points, self.candidates_per_point, self.least_views) < 1:
+            raise UserError("numbers of points and views must be positive", got=str(self))
+        if not 0 <= self.quantile <= 1 or not 0 < self.normal_radius < 1:
+            raise UserError(
+                "the quantile or the radius of normals is out of range",
+                got=f"{self.quantile:g} and {self.normal_radius:g}",
+                wanted="values in [0, 1]",
+            )
+
+
+def seen_points(
+    mesh: TriangleMesh,
+    views: Views,
+    occlusion: OcclusionTest,
+    config: ColorGathering,
+    generator: np.random.Generator,
+) -> tuple[SurfacePoints, np.ndarray]:
+    """Points that photographs show well, and their linear colours, float32 [points, 3].
+
+    Args:
+        mesh: the object in the world of the cameras.
+        views: photographs.
+        occlusion: of the same mesh.
+        config: the settings.
+        generator: draws the points.
+    """
+    count = config.num_points * config.candidates_per_point
+    candidates = surface_points(mesh, count, config.normal_radius, generator)
+    colors = seen_colors(candidates, views, occlusion, config.quantile, min(config.least_views, len(views)))
+    kept = np.flatnonzero(np.isfinite(colors).all(-1))[: config.num_points]
+    return candidates[kept], colors[kept]
+
+
+def surface_points(mesh: TriangleMesh, count: int, radius: float, generator: np.random.Generator) -> SurfacePoints:
+    """Points spread evenly over the surface, with the mean normal of the faces around each.
+
+    Args:
+        mesh: the object.
+        count: number of points.
+        radius: of the neighbourhood whose normals are averaged, which irons out small dents.
+        generator: draws the points.
+    """
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(cross, axis=1) / 2
+    face = generator.choice(len(areas), count, p=areas / areas.sum())
+    u, v = np.sqrt(generator.random(count)), generator.random(count)
+    weights = np.stack([1 - u, u * (1 - v), u * v], -1)
+    positions = (corners[face] * weights[..., None]).sum(1)
+    flat = cross / np.maximum(2 * areas, 1e-20)[:, None]
+    normals = _averaged(positions, flat[face], corners.mean(1), cross, radius)
+    return SurfacePoints(positions.astype(np.float32), normals.astype(np.float32))
+
+
+def _averaged(
+    positions: np.ndarray, own: np.ndarray, centres: np.ndarray, weighted: np.ndarray, radius: float
+) -> np.ndarray:
+    """Unit means of the area-weighted normals of faces within `radius` that look the same way as the point's own."""
+    near = cKDTree(centres).query_ball_point(positions, radius)
+    total = own * 1e-9
+    for index, faces in enumerate(near):
+        around = weighted[faces]
+        total[index] += around[around @ own[index] > 0].sum(0)
+    return total / np.linalg.norm(total, axis=1, keepdims=True)
+
+
+def seen_colors(
+    points: SurfacePoints, views: Views, occlusion: OcclusionTest, quantile: float, least_views: int
+) -> np.ndarray:
+    """What photographs show at points.
+
+    Args:
+        points: on the surface.
+        views: photographs.
+        occlusion: of the same mesh.
+        quantile: which of the colours that different photographs show, per channel: low ones leave highlights out.
+        least_views: points seen by fewer are left out.
+
+    Returns:
+        Linear colours, float32 [points, 3]; NaN where too few photographs see the point, or it is overexposed in them.
+    """
+    num_views, num_points = len(views), len(points)
+    pixels, depth = views.cameras.project(points.positions)
+    toward = views.cameras.positions[:, None] - points.positions
+    distance = np.linalg.norm(toward, axis=-1, keepdims=True)
+    toward = toward / np.maximum(distance, 1e-9)
+    cosine = (toward * points.normals).sum(-1)
+    asked = (depth > 0) & (cosine > _LEAST_COSINE) & _is_inside(pixels, views)
+    colors = np.full((num_views, num_points, 3), np.nan, np.float32)
+    for view in range(num_views):
+        index = np.flatnonzero(asked[view])
+        srgb, alpha = _looked_up(views.srgb[view], views.alpha[view], pixels[view, index])
+        index, srgb = index[alpha > _OPAQUE], srgb[alpha > _OPAQUE]
+        starts = points.positions[index] + _OFFSET * points.normals[index]
+        is_free = ~occlusion.is_blocked(starts, toward[view, index])
+        colors[view, index[is_free]] = srgb[is_free]
+    enough = np.isfinite(colors[..., 0]).sum(0) >= max(least_views, 1)
+    result = np.full((num_points, 3), np.nan, np.float32)
+    # colours in sRGB sort as linear ones do
+    if enough.any():
+        result[enough] = np.nanquantile(colors[:, enough], quantile, axis=0)
+    result[(result > _CLIPPED_SRGB).any(-1)] = np.nan
+    return linear_from_srgb(result)
+
+
+def _is_inside(pixels: np.ndarray, views: Views) -> np.ndarray:
+    size = np.array([views.cameras.width, views.cameras.height])
+    inside = (pixels > 0.5) & (pixels < size - 0.5)
+    return inside[..., 0] & inside[..., 1]
+
+
+def _looked_up(srgb: np.ndarray, alpha: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bilinear colour [n, 3] and coverage [n] at image points (x, y) [n, 2]."""
+    image = np.dstack([srgb, alpha])
+    at = pixels - 0.5
+    corner = np.minimum(np.floor(at).astype(int), np.array(alpha.shape[::-1]) - 2)
+    x, y = corner.T
+    u, v = (at - corner).T[..., None]
+    upper = (1 - u) * image[y, x] + u * image[y, x + 1]
+    lower = (1 - u) * image[y + 1, x] + u * image[y + 1, x + 1]
+    value = (1 - v) * upper + v * lower
+    return value[:, :3], value[:, 3]
+
+
+def light_transport(points: SurfacePoints, occlusion: OcclusionTest, height: int) -> np.ndarray:
+    """Diffuse shading per radiance of every texel of an equirectangular map, without interreflections.
+
+    Args:
+        points: on the surface.
+        occlusion: of the same mesh.
+        height: rows of the map.
+
+    Returns:
+        float32 [points, height * 2 * height]: its product with radiance is irradiance over pi, 1 in a furnace of 1.
+    """
+    blank = EnvironmentMap(np.ones((height, 2 * height, 3), np.float32))
+    directions = blank.directions().reshape(-1, 3)
+    solid_angles = np.broadcast_to(blank.solid_angles()[..., 0], (height, 2 * height)).ravel()
+    cosine = points.normals @ directions.T
+    point, texel = np.nonzero(cosine > 0)
+    starts = points.positions[point] + _OFFSET * points.normals[point]
+    is_blocked = occlusion.is_blocked(starts, directions[texel])
+    transport = np.zeros(cosine.shape, np.float32)
+    transport[point, texel] = np.where(is_blocked, 0, cosine[point, texel] * solid_angles[texel] / np.pi)
+    return transport
