@@ -1,8 +1,9 @@
 """The whole method on one page.
 
     photographs --import--> capture --UniSDF--> geometry            once per object
+    capture + geometry --> the photographs' own light               (ours, not the paper's)
     geometry + light --path tracer--> radiance cues                 once per light, from here on
-    capture + cues --relighting diffusion model--> S samples of every photograph
+    capture + own light + cues --relighting diffusion model--> S samples of every photograph
     samples + geometry --latent NeRF--> one relit object
     relit object --render--> turntable, unseen views, scores
 
@@ -27,6 +28,7 @@ from illuminerf.scene.images import read_png
 from illuminerf.scene.video import write_mp4
 from illuminerf.stages import (
     estimate_geometry,
+    estimate_illumination,
     evaluate_relighting,
     fit_latent_nerf,
     import_capture,
@@ -72,12 +74,15 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
     capture = import_capture.run(source, preset.capture, out / "capture")
     geometry = estimate_geometry.run(capture, preset.geometry, out / "geometry")
     _copy(geometry / "mesh.glb", out / "mesh.glb")
+    illumination = None
+    if preset.illumination is not None:
+        illumination = estimate_illumination.run(geometry, capture, preset.illumination, out / "illumination")
     lights: dict[str, dict[str, Path]] = {}
     scores: dict[str, Any] = {}
     for job in jobs:
         say(f"light: {job.name}")
         folder = out / "lights" / job.name
-        made = lights[job.name] = relight_under(capture, geometry, job.light, preset, folder)
+        made = lights[job.name] = relight_under(capture, geometry, illumination, job.light, preset, folder)
         if job.test_cameras is not None:
             cameras = _in_unit_ball(job.test_cameras, capture, folder / "test_cameras.json")
             made["test_views"] = render_novel_views.run(
@@ -90,14 +95,19 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
             scores[job.name] = read_metrics(made["scores"])
     first = lights[jobs[0].name]
     _copy(first["video"], out / "turntable.mp4")
-    write_report(out / "report.html", out, {"capture": capture, "geometry": geometry}, lights, scores)
+    shared = {"capture": capture, "geometry": geometry}
+    if illumination is not None:
+        shared["illumination"] = illumination
+    write_report(out / "report.html", out, shared, lights, scores)
     return scores
 
 
-def relight_under(capture: Path, geometry: Path, light: Path, preset: Preset, out: Path) -> dict[str, Path]:
+def relight_under(
+    capture: Path, geometry: Path, illumination: Path | None, light: Path, preset: Preset, out: Path
+) -> dict[str, Path]:
     """The per-light half of the method; returns its artefacts by name."""
     cues = render_radiance_cues.run(geometry, capture, light, preset.cues, out / "cues")
-    relit = relight_views.run(capture, cues, preset.relighting_model, preset.relighting, out / "relit")
+    relit = relight_views.run(capture, cues, preset.relighting_model, illumination, preset.relighting, out / "relit")
     latent_nerf = fit_latent_nerf.run(geometry, capture, relit, preset.latent_nerf, out / "latent_nerf")
     turntable = render_novel_views.run(latent_nerf, None, preset.turntable, out / "turntable")
     video = out / "turntable.mp4"

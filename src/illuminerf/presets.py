@@ -9,6 +9,7 @@ from illuminerf.cues.renderer import CueSampling
 from illuminerf.fields.optimisation import OptimiserConfig
 from illuminerf.stages import (
     estimate_geometry,
+    estimate_illumination,
     evaluate_relighting,
     fit_latent_nerf,
     import_capture,
@@ -29,6 +30,8 @@ class Preset:
     """What it is for and what it costs."""
     capture: import_capture.Config = field(default_factory=import_capture.Config)
     geometry: estimate_geometry.Config = field(default_factory=estimate_geometry.Config)
+    illumination: estimate_illumination.Config | None = None
+    """How the photographs' own light is estimated, for relighting models that take it as a hint; None: it is not."""
     cues: render_radiance_cues.Config = field(default_factory=render_radiance_cues.Config)
     relighting_model: str = "embedded"
     """The weights that ship with the package, or a folder."""
@@ -43,6 +46,7 @@ EMBEDDED = Preset(
     name="embedded",
     description="The default: for two CPU cores and photographs of about 200 pixels; a GPU makes it faster.",
     capture=import_capture.Config(size=200),
+    illumination=estimate_illumination.Config(sampling=CueSampling(samples_per_pixel=16)),
     # cheap; noise of the cues reaches the samples, and the distillation averages over views
     cues=render_radiance_cues.Config(sampling=CueSampling(samples_per_pixel=16)),
     latent_nerf=fit_latent_nerf.Config(optimiser=OptimiserConfig(num_steps=2000, rays_per_step=1024, warmup_steps=40)),
@@ -55,6 +59,7 @@ DEMO = dataclasses.replace(
     description="The bundled capture in minutes on two CPU cores: fewer steps and samples than `embedded`.",
     capture=import_capture.Config(),
     geometry=estimate_geometry.Config(optimiser=OptimiserConfig(num_steps=2000)),
+    illumination=estimate_illumination.Config(sampling=CueSampling(samples_per_pixel=64)),
     cues=render_radiance_cues.Config(sampling=CueSampling(samples_per_pixel=64)),
     relighting=relight_views.Config(num_samples=4),
     latent_nerf=fit_latent_nerf.Config(optimiser=OptimiserConfig(num_steps=1500, rays_per_step=1024, warmup_steps=30)),
@@ -142,6 +147,8 @@ def customised(
         preset,
         capture=change(preset.capture, **capture),
         geometry=change(preset.geometry, **common),
+        illumination=preset.illumination
+        and change(preset.illumination, seed=seed, sampling=change(preset.illumination.sampling, device=device)),
         cues=change(
             preset.cues,
             seed=seed,

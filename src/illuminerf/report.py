@@ -42,13 +42,15 @@ def write_report(
     Args:
         out: the HTML file to write.
         run: the run's folder; its name is the title.
-        stages: artefacts all lights share: "capture", "geometry".
+        stages: artefacts all lights share: "capture", "geometry", and "illumination" where there is one.
         lights: for each light's name its artefacts: "cues", "relit", "latent_nerf", "turntable", and the file
             "video" where there is one.
         scores: by light, {"psnr": dB, "ssim": ...}, where there is truth.
     """
     body = [f"<h1>{html.escape(run.resolve().name)}</h1><p class=note>Open IllumiNeRF: one object, relit.</p>"]
     body += [_inputs(stages["capture"]), _geometry(stages["geometry"])]
+    if "illumination" in stages:
+        body.append(_illumination(stages["illumination"]))
     for name, artefacts in lights.items():
         body.append(_light(name, artefacts, stages["capture"]))
     if scores:
@@ -73,6 +75,11 @@ def _geometry(geometry: Path) -> str:
     normals = sorted((geometry / "normals").glob("*.png"))
     pictures = [(on_white(read_png(path)), f"normals {path.stem}") for path in _spread(normals)]
     return f"<h2>Geometry</h2>{_row(pictures)}"
+
+
+def _illumination(illumination: Path) -> str:
+    caption = "estimated light; photographs, shading, albedo"
+    return f"<h2>The photographs' own light</h2>{_row([(read_png(illumination / 'preview.png'), caption)])}"
 
 
 def _light(name: str, artefacts: dict[str, Path], capture: Path) -> str:
