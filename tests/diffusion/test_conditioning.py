@@ -138,7 +138,8 @@ def test_unlit_images_are_straight_and_need_no_shading() -> None:
 def test_cues_and_shading_reach_the_texture_only_of_materials(is_material: bool) -> None:
     torch.manual_seed(0)
     network = material_network() if is_material else TextureNetwork(TextureConfig((8, 8, 32), 2, patch=4))
-    nn.init.normal_(network.out.weight)
+    for layer in (network.out, network.lit_out) if is_material else (network.out,):
+        nn.init.normal_(layer.weight)
     image, cues = random_condition_inputs(2, 32)
     shading = cues[:, :3]
     texture = network(image, cues, shading)

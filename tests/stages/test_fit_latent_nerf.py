@@ -90,6 +90,22 @@ def test_zero_code_lies_between_the_samples(
     assert abs(dark - sample[sample.max(-1) > 0].mean()) < 0.05
 
 
+def test_colours_do_not_darken_where_mask_and_surface_disagree(
+    geometry: Path, sphere_capture: Path, relit: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(sphere_capture, tmp_path / "soft")
+    for path in sorted((tmp_path / "soft" / "images").glob("*.png")):
+        image = read_png(path)
+        image[..., 3] *= 0.6
+        write_png(path, image)
+        for sample in range(3):  # the very colour 0.5 everywhere, over black
+            even = np.repeat(0.5 * image[..., 3:], 3, -1)
+            write_png(tmp_path / "relit" / "samples" / f"{path.stem}_{sample:02d}.png", even)
+    fitted = fit_latent_nerf.run(geometry, tmp_path / "soft", tmp_path / "relit", CONFIG, tmp_path / "nerf")
+    brightness = _brightness(fitted, sphere_capture, None, tmp_path / "views")
+    assert abs(brightness - 0.5) < 0.04  # 0.3 if the mask's coverage were taken for the surface's
+
+
 def test_geometry_is_untouched(geometry: Path, latent_nerf: Path) -> None:
     from illuminerf.fields.storage import load_field
 

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from illuminerf.diffusion.cue_coding import CueCoding, code_cues, encode_cues
 from illuminerf.diffusion.materials import composited
@@ -54,13 +53,10 @@ class AugmentationConfig:
     """Standard deviation of the log gain per colour channel of each light in a mixture."""
     exposure: float = 0.4
     """Standard deviation of the log exposure of input and target, independently."""
-    unknown_shading_share: float = 0.35
+    unknown_shading_share: float = 0.5
     """Share of examples whose shading under the input light is kept from the model."""
-    shading_error: float = 0.4
+    shading_error: float = 0.25
     """How wrong the others' shading is: another light mixed in, contrast and colours changed; 0: exact."""
-    dents: float = 0.1
-    """Largest standard deviation of the log of a smooth noise on the diffuse cues and the shading, three times as much
-    on the specular ones: estimated meshes are dented where the renders' are not."""
     turns: bool = True
     """Turn pictures by quarters: light and view turn together, so cues and target still agree."""
     level: float = TRAINING_LEVEL
@@ -70,8 +66,8 @@ class AugmentationConfig:
         shares = (self.composited_share, self.mixture_share, self.unknown_shading_share)
         if not all(0 <= share <= 1 for share in shares):
             raise ValueError("shares are between 0 and 1")
-        if min(self.tint, self.exposure, self.level, self.shading_error, self.dents) < 0:
-            raise ValueError("tint, exposure, level, shading_error and dents are not negative")
+        if min(self.tint, self.exposure, self.level, self.shading_error) < 0:
+            raise ValueError("tint, exposure, level and shading_error are not negative")
 
 
 def make_batch(
@@ -145,10 +141,7 @@ def _example(
     shading = torch.zeros_like(images[0])
     if _uniform(generator) >= config.unknown_shading_share:
         shading = gains[0] * _estimated_shading(item, mixtures[0], order[-1], alpha, config, generator)[channels]
-    cues = cue_stacks[1]
-    if config.dents > 0:
-        shading, cues = _dented(shading, cues, config.dents, generator)
-    example = Example(images[0], cues, images[1], alpha, surface, shading)
+    example = Example(images[0], cue_stacks[1], images[1], alpha, surface, shading)
     is_mirrored, quarter_turns = _uniform(generator) < 0.5, 0
     if config.turns:
         quarter_turns = _integer(4, generator)
@@ -178,22 +171,6 @@ def _estimated_shading(
     power = 1 + error * (0.45 * _uniform(generator) - 0.3)
     gains = 0.2 * torch.randn((), generator=generator) + 0.15 * torch.randn(3, generator=generator)
     return mean * (shading / mean).clamp_min(1e-4) ** power * torch.exp(error * gains)[:, None, None]
-
-
-def _dented(
-    shading: Float[Tensor, "3 height width"],
-    cues: Float[Tensor, "12 height width"],
-    largest: float,
-    generator: torch.Generator,
-) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "12 height width"]]:
-    """What dents in the mesh do to shading and cues, roughly: smooth noise on their logarithm, another per material."""
-    height, width = cues.shape[-2:]
-    pixels = 2 + _integer(5, generator)  # a dent's size
-    coarse = torch.randn(1, 5, -(-height // pixels) + 1, -(-width // pixels) + 1, generator=generator)
-    noise = functional.interpolate(coarse, (height, width), mode="bilinear", align_corners=True)[0]
-    spread = largest * _uniform(generator) * torch.tensor([1.0, 1.0, 3.0, 3.0, 3.0])
-    factors = torch.exp(spread[:, None, None] * noise)
-    return shading * factors[:1], (cues.unflatten(0, (4, 3)) * factors[1:, None]).flatten(0, 1)
 
 
 def composited_target(

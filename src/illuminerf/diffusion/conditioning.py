@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -204,16 +204,10 @@ class TextureNetwork(nn.Module):
         self.refines = nn.ModuleList(ResidualBlock(width) for width in widths[-2::-1] if config.is_material)
         self.out = nn.Conv2d(widths[0], num_maps * patch**2, 3 if patch == 1 else 1, 1, int(patch == 1))
         if config.is_material:
-            self._start_as_unlit_image()
-
-    def _start_as_unlit_image(self) -> None:
-        """Before training: a rough dielectric, diffuse texture = image / shading and 0.04 of the roughest lobe."""
-        with torch.no_grad():
-            nn.init.zeros_(self.out.weight)
-            start = torch.zeros(2, NUM_CUE_CHANNELS)
-            start[0, 3:9], start[0, 9:] = -0.3, 0.208
-            assert self.out.bias is not None
-            self.out.bias.copy_(start.reshape(-1).repeat_interleave(self.config.patch**2))
+            # What is certain with the shading is a guess without it: each case has a last layer of its own.
+            self.lit_out = nn.Conv2d(widths[0], num_maps * patch**2, 3 if patch == 1 else 1, 1, int(patch == 1))
+            _start_as_unlit_image(self.out, patch)
+            _start_as_unlit_image(self.lit_out, patch)
 
     def maps(
         self,
@@ -238,7 +232,10 @@ class TextureNetwork(nn.Module):
             features = up(features)
             if self.config.is_material:
                 features = self.refines[level](features + skips.pop())
-        return functional.pixel_shuffle(self.out(features), patch)
+        maps = self.out(features)
+        if self.config.is_material:
+            maps = torch.where(_is_known(shading), self.lit_out(features), maps)
+        return functional.pixel_shuffle(maps, patch)
 
     def texture(
         self,
@@ -270,9 +267,22 @@ def unlit(
     """The straight image divided by its shading, which is the albedo of a matt object, coded as cues are; where the
     shading is unknown (all zeros), divided by the usual one."""
     straight = (masked_image[:, :3] / masked_image[:, 3:].clamp_min(_LEAST_COVERAGE)).clamp(0, 1)
-    is_known = (shading.amax((1, 2, 3), keepdim=True) > 0).to(shading)
-    divisor = shading.clamp_min(_DARKEST_SHADING) * is_known + _USUAL_SHADING * (1 - is_known)
+    divisor = shading.clamp_min(_DARKEST_SHADING).where(_is_known(shading), _USUAL_SHADING)
     return (encode_cues(linear_from_srgb(straight)) / divisor).clamp_max(_BRIGHTEST_UNLIT)
+
+
+def _is_known(shading: Float[Tensor, "batch 3 height width"]) -> Bool[Tensor, "batch 1 1 1"]:
+    return shading.amax((1, 2, 3), keepdim=True) > 0
+
+
+def _start_as_unlit_image(last: nn.Conv2d, patch: int) -> None:
+    """Before training: a rough dielectric, diffuse texture = image / shading and 0.04 of the roughest lobe."""
+    start = torch.zeros(2, NUM_CUE_CHANNELS)
+    start[0, 3:9], start[0, 9:] = -0.3, 0.208
+    with torch.no_grad():
+        nn.init.zeros_(last.weight)
+        assert last.bias is not None
+        last.bias.copy_(start.reshape(-1).repeat_interleave(patch**2))
 
 
 class Conditioning(nn.Module):

@@ -6,7 +6,7 @@ import torch
 from diffusers import AutoencoderKL, UNet2DConditionModel
 from torch import nn
 
-from illuminerf.diffusion.conditioning import NUM_CUE_CHANNELS, NUM_IMAGE_CHANNELS
+from illuminerf.diffusion.conditioning import NUM_CUE_CHANNELS, NUM_IMAGE_CHANNELS, NUM_SHADING_CHANNELS
 from illuminerf.diffusion.controlled_base import ControlledBase, ControlledBaseConfig
 from illuminerf.diffusion.dilightnet import DILIGHTNET
 from illuminerf.diffusion.frozen_base import FrozenBase
@@ -97,7 +97,7 @@ def layer_tables(model: RelightingModel | ControlledBase) -> dict[str, list[Laye
         tables["ConvNet 1"] = rows
     image = torch.empty(1, NUM_IMAGE_CHANNELS, size, size, device="meta")
     cues = torch.empty(1, NUM_CUE_CHANNELS, size, size, device="meta")
-    tables["ConvNet 2"] = _rows(model.conditioning.texture, image, cues)
+    tables["ConvNet 2"] = _rows(model.conditioning.texture, image, cues, cues[:, :NUM_SHADING_CHANNELS])
     tables["ConvNet 3"] = _rows(model.conditioning.embedding, cues)
     latent = torch.empty(1, *model.latent_shape(size, size), device="meta")
     tables["ConvNet 4"] = _rows(model.control.conv_in, latent)

@@ -123,7 +123,7 @@ class Config:
             final_share=0.0,
             average_decay=0.9999,
             augmentation=AugmentationConfig(
-                composited_share=0.0, mixture_share=0.0, tint=0.0, exposure=0.0, unknown_shading_share=1.0, dents=0.0
+                composited_share=0.0, mixture_share=0.0, tint=0.0, exposure=0.0, unknown_shading_share=1.0
             ),
             execution=ExecutionConfig(precision="bfloat16", num_threads=8, checkpoints_gradients=True),
             checkpoint_seconds=1800.0,

@@ -24,7 +24,7 @@ class RayPool:
         view: which view each ray belongs to.
         pixel: row * width + column.
         near, far: the stretch of the ray inside the bounds.
-        num_foreground: rays [0, num_foreground) have coverage above 0.
+        num_foreground: rays [0, num_foreground) are covered.
     """
 
     view: Int[Tensor, " rays"]
@@ -56,6 +56,11 @@ class RayPool:
         parts = (self.view[chosen], self.pixel[chosen], self.near[chosen], self.far[chosen])
         return RayPool(*parts, len(chosen), self.cameras)
 
+    def values(self, images: np.ndarray) -> Tensor:
+        """Values of images [views, height, width, ...] at the rays' pixels: [rays, ...]."""
+        flat = torch.from_numpy(images.reshape(len(images), -1, *images.shape[3:]))
+        return flat[self.view.cpu(), self.pixel.cpu()].to(self.view.device)
+
     def rays(
         self, index: Int[Tensor, " batch"]
     ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"], Float[Tensor, " batch"], Float[Tensor, " batch"]]:
@@ -73,12 +78,17 @@ def pixel_rays(
 
 
 def gather_rays(
-    cameras: Cameras, alpha: np.ndarray, cells: OccupiedCells, device: torch.device | str = "cpu"
+    cameras: Cameras,
+    alpha: np.ndarray,
+    cells: OccupiedCells,
+    device: torch.device | str = "cpu",
+    least_coverage: float = 0.0,
 ) -> RayPool:
     """All pixels whose rays meet occupied cells.
 
     Args:
         alpha: float32 [views, height, width]; only says which rays are foreground and which are too far from it.
+        least_coverage: foreground is what has more.
 
     Raises:
         UserError: no ray meets the bounds.
@@ -96,7 +106,7 @@ def gather_rays(
             pixels.append(pixel[hit])
             nears.append(near[hit])
             fars.append(far[hit])
-            foreground.append(torch.from_numpy(alpha[view].reshape(-1)[chunk] > 0).to(device)[hit])
+            foreground.append(torch.from_numpy(alpha[view].reshape(-1)[chunk] > least_coverage).to(device)[hit])
     is_foreground = torch.cat(foreground)
     if not len(is_foreground):
         raise UserError("no camera ray meets the object's bounds", fix="check the capture's cameras and scale")

@@ -14,7 +14,7 @@ from illuminerf.fields.image_rendering import observed_cells, render_image
 from illuminerf.fields.meshing import extract_mesh
 from illuminerf.fields.optimisation import OptimiserConfig, fit
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
-from illuminerf.fields.ray_pool import RayPool, gather_rays
+from illuminerf.fields.ray_pool import gather_rays
 from illuminerf.fields.storage import StoredField, save_field
 from illuminerf.fields.surface import surface_cells
 from illuminerf.scene.images import write_png
@@ -126,8 +126,8 @@ def _fit(
 ) -> None:
     device = hull.cells.device
     pool = gather_rays(views.cameras[fitted], views.alpha[fitted], hull, device)
-    srgb = _per_ray(pool, views.premultiplied()[fitted])
-    alpha = _per_ray(pool, views.alpha[fitted]) if has_masks else None
+    srgb = pool.values(views.premultiplied()[fitted])
+    alpha = pool.values(views.alpha[fitted]) if has_masks else None
 
     def step_loss(step: int) -> tuple[torch.Tensor, dict[str, float]]:
         generator = torch_generator(config.seed, "geometry", step, device=device)
@@ -153,12 +153,6 @@ def _split(num_views: int, num_held_out: int) -> tuple[list[int], list[int]]:
         return list(range(num_views)), []
     held_out = [int((i + 0.5) * num_views / num_held_out) for i in range(num_held_out)]
     return [view for view in range(num_views) if view not in held_out], held_out
-
-
-def _per_ray(pool: RayPool, images: np.ndarray) -> torch.Tensor:
-    """Values of images [views, height, width, ...] at the pool's pixels."""
-    flat = torch.from_numpy(images.reshape(len(images), -1, *images.shape[3:]))
-    return flat[pool.view.cpu(), pool.pixel.cpu()].to(pool.view.device)
 
 
 def _save_previews(

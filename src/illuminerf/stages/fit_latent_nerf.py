@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -18,6 +19,8 @@ from illuminerf.scene.images import read_png, to_uint8
 from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.device import resolve_device, torch_generator
 from illuminerf.workflow.errors import UserError
+
+_LEAST_COVERAGE = 0.5  # below it a pixel says little of the object's colour
 
 
 @dataclass(frozen=True)
@@ -86,13 +89,16 @@ def run(geometry_path: Path, capture_path: Path, relit_path: Path, config: Confi
             )
         views = load_capture(capture_path).views
         sample_views, num_samples = find_samples(relit_path, len(views))
-        pool = gather_rays(views.cameras[sample_views], views.alpha[sample_views], stored.cells, device)
+        alpha = views.alpha[sample_views]
+        least = _LEAST_COVERAGE if (alpha > _LEAST_COVERAGE).any() else 0.0
+        pool = gather_rays(views.cameras[sample_views], alpha, stored.cells, device, least)
         pool = pool.foreground_subset(config.max_rays, torch_generator(config.seed, "pixels", device=device))
         targets = _targets(relit_path, pool, sample_views, num_samples)
         cache = cache_shading(stored.field, pool, config.num_kept)
+        coverage = pool.values(alpha)
         generator = torch_generator(config.seed, "latents")
         model = _LatentNerf(stored.field, len(sample_views) * num_samples, generator)
-        psnr = _fit(model, stored.field, cache, pool, targets, config, out / "checkpoint.safetensors")
+        psnr = _fit(model, stored.field, cache, pool, targets, coverage, config, out / "checkpoint.safetensors")
         latents = model.latents.detach() if config.use_latents else None
         save_field(out, StoredField(stored.field, stored.cells, latents))
         (out / "checkpoint.safetensors").unlink(missing_ok=True)
@@ -136,19 +142,25 @@ def _fit(
     cache: ShadingCache,
     pool: RayPool,
     targets: Tensor,
+    coverage: Float[Tensor, " rays"],
     config: Config,
     checkpoint: Path,
 ) -> float:
-    """Optimise; returns the PSNR over the last steps."""
+    """Optimise; returns the PSNR over the last steps.
+
+    At an outline, mask and surface never quite agree. There the surface shall have the object's colour, not a dark one
+    that makes up for too much opacity: targets over black are brought from the mask's coverage to the surface's.
+    """
     device = cache.weights.device
     num_samples, recent = len(targets), [0.0]
+    to_opacity = (cache.weights.sum(-1) / coverage.clamp_min(1e-3))[:, None]
 
     def step_loss(step: int) -> tuple[Tensor, dict[str, float]]:
         generator = torch_generator(config.seed, "latent nerf", step, device=device)
         size = (config.optimiser.rays_per_step,)
         index = torch.randint(pool.num_foreground, size, generator=generator, device=device)
         sample = torch.randint(num_samples, size, generator=generator, device=device)
-        target = targets[sample, index].float() / 255
+        target = (targets[sample, index].float() / 255 * to_opacity[index]).clamp_max(1)
         latents = None
         if config.use_latents:
             latents = functional.embedding(pool.view[index] * num_samples + sample, model.latents)
