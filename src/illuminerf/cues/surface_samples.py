@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from illuminerf.cues.mitsuba_scene import mitsuba_mesh
@@ -21,8 +22,8 @@ _OPAQUE = 0.98
 _CLIPPED_SRGB = 0.985
 
 
-class OcclusionTest:
-    """Whether rays hit a mesh.
+class RayCaster:
+    """Where rays hit a mesh.
 
     Args:
         mesh: the object.
@@ -34,23 +35,22 @@ class OcclusionTest:
         shape = mitsuba_mesh(self._mitsuba, "mesh", mesh.vertices, mesh.faces, {"type": "diffuse"})
         self._scene: Any = self._mitsuba.load_dict({"type": "scene", "mesh": shape})
 
-    def is_blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Bool [rays] for rays that never end, float [rays, 3] each; directions are unit."""
+    def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """How far rays go, float32 [rays], infinite where they hit nothing; origins and unit directions [rays, 3]."""
         mi, is_scalar = self._mitsuba, self._mitsuba.variant().startswith("scalar")
-        blocked = np.zeros(len(origins), bool)
+        found = np.zeros(len(origins), np.float32)
         for first in range(0, len(origins), _RAYS_PER_PASS):
             part = slice(first, first + _RAYS_PER_PASS)
             starts, toward = (np.ascontiguousarray(a[part], np.float32) for a in (origins, directions))
             if is_scalar:
-                rays = (
-                    mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
-                    for o, d in zip(starts.tolist(), toward.tolist(), strict=True)
-                )
-                blocked[part] = [self._scene.ray_test(ray) for ray in rays]
+                rays = zip(starts.tolist(), toward.tolist(), strict=True)
+                found[part] = [self._distance(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))) for o, d in rays]
             else:
-                ray = mi.Ray3f(mi.Point3f(*starts.T), mi.Vector3f(*toward.T))
-                blocked[part] = np.array(self._scene.ray_test(ray))
-        return blocked
+                found[part] = self._distance(mi.Ray3f(mi.Point3f(*starts.T), mi.Vector3f(*toward.T)))
+        return found
+
+    def _distance(self, ray: Any) -> Any:
+        return self._scene.ray_intersect_preliminary(ray).t
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class ColorGathering:
     """Points to keep."""
     candidates_per_point: int = 3
     """Points drawn for every one to keep; those that photographs do not show well are dropped."""
-    normal_radius: float = 0.03
+    normal_radius: float = 0.05
     """Normals are averaged over faces within this distance, in radii of the unit ball, which irons out dents."""
     quantile: float = 0.25
     """Which of the colours that a point shows in different photographs counts; low ones leave highlights out."""
@@ -101,7 +101,7 @@ class ColorGathering:
 def seen_points(
     mesh: TriangleMesh,
     views: Views,
-    occlusion: OcclusionTest,
+    caster: RayCaster,
     config: ColorGathering,
     generator: np.random.Generator,
 ) -> tuple[SurfacePoints, np.ndarray]:
@@ -110,13 +110,13 @@ def seen_points(
     Args:
         mesh: the object in the world of the cameras.
         views: photographs.
-        occlusion: of the same mesh.
+        caster: of the same mesh.
         config: the settings.
         generator: draws the points.
     """
     count = config.num_points * config.candidates_per_point
     candidates = surface_points(mesh, count, config.normal_radius, generator)
-    colors = seen_colors(candidates, views, occlusion, config.quantile, min(config.least_views, len(views)))
+    colors = seen_colors(candidates, views, caster, config.quantile, min(config.least_views, len(views)))
     kept = np.flatnonzero(np.isfinite(colors).all(-1))[: config.num_points]
     return candidates[kept], colors[kept]
 
@@ -155,14 +155,14 @@ def _averaged(
 
 
 def seen_colors(
-    points: SurfacePoints, views: Views, occlusion: OcclusionTest, quantile: float, least_views: int
+    points: SurfacePoints, views: Views, caster: RayCaster, quantile: float, least_views: int
 ) -> np.ndarray:
     """What photographs show at points.
 
     Args:
         points: on the surface.
         views: photographs.
-        occlusion: of the same mesh.
+        caster: of the same mesh.
         quantile: which of the colours that different photographs show, per channel: low ones leave highlights out.
         least_views: points seen by fewer are left out.
 
@@ -182,7 +182,7 @@ def seen_colors(
         srgb, alpha = _looked_up(views.srgb[view], views.alpha[view], pixels[view, index])
         index, srgb = index[alpha > _OPAQUE], srgb[alpha > _OPAQUE]
         starts = points.positions[index] + _OFFSET * points.normals[index]
-        is_free = ~occlusion.is_blocked(starts, toward[view, index])
+        is_free = np.isinf(caster.distances(starts, toward[view, index]))
         colors[view, index[is_free]] = srgb[is_free]
     enough = np.isfinite(colors[..., 0]).sum(0) >= max(least_views, 1)
     result = np.full((num_points, 3), np.nan, np.float32)
@@ -212,12 +212,12 @@ def _looked_up(srgb: np.ndarray, alpha: np.ndarray, pixels: np.ndarray) -> tuple
     return value[:, :3], value[:, 3]
 
 
-def light_transport(points: SurfacePoints, occlusion: OcclusionTest, height: int) -> np.ndarray:
+def light_transport(points: SurfacePoints, caster: RayCaster, height: int) -> np.ndarray:
     """Diffuse shading per radiance of every texel of an equirectangular map, without interreflections.
 
     Args:
         points: on the surface.
-        occlusion: of the same mesh.
+        caster: of the same mesh.
         height: rows of the map.
 
     Returns:
@@ -229,7 +229,30 @@ def light_transport(points: SurfacePoints, occlusion: OcclusionTest, height: int
     cosine = points.normals @ directions.T
     point, texel = np.nonzero(cosine > 0)
     starts = points.positions[point] + _OFFSET * points.normals[point]
-    is_blocked = occlusion.is_blocked(starts, directions[texel])
+    is_free = np.isinf(caster.distances(starts, directions[texel]))
     transport = np.zeros(cosine.shape, np.float32)
-    transport[point, texel] = np.where(is_blocked, 0, cosine[point, texel] * solid_angles[texel] / np.pi)
+    transport[point, texel] = np.where(is_free, cosine[point, texel] * solid_angles[texel] / np.pi, 0)
     return transport
+
+
+def interreflection(
+    points: SurfacePoints, caster: RayCaster, rays_per_point: int, generator: np.random.Generator
+) -> csr_matrix:
+    """Diffuse shading per radiance of the other points, [points, points]; rows sum to what a point sees of the mesh.
+
+    Args:
+        points: on the surface; what a ray hits counts as the nearest of them.
+        caster: of the same mesh.
+        rays_per_point: cosine-weighted directions to look into.
+        generator: draws them.
+    """
+    num_points = len(points)
+    directions = generator.normal(size=(num_points, rays_per_point, 3))
+    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True) + points.normals[:, None]
+    directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).reshape(-1, 3)
+    starts = np.repeat(points.positions + _OFFSET * points.normals, rays_per_point, 0)
+    distance = caster.distances(starts, directions)
+    hit = np.flatnonzero(np.isfinite(distance))
+    seen = cKDTree(points.positions).query(starts[hit] + distance[hit, None] * directions[hit])[1]
+    shares = np.full(len(hit), 1 / rays_per_point)
+    return csr_matrix((shares, (hit // rays_per_point, seen)), shape=(num_points, num_points))
