@@ -17,6 +17,7 @@ from illuminerf.workflow.errors import UserError
 
 _RAYS_PER_PASS = 2**20
 _OFFSET = 4e-3  # of the unit ball: rays start this far above the surface, beyond its dents
+_POINTS_FOR_NORMALS = 30_000
 _LEAST_COSINE = 0.2  # photographs that see a point at a flatter angle are not asked
 _OPAQUE = 0.98
 _CLIPPED_SRGB = 0.985
@@ -81,7 +82,7 @@ class ColorGathering:
     candidates_per_point: int = 3
     """Points drawn for every one to keep; those that photographs do not show well are dropped."""
     normal_radius: float = 0.05
-    """Normals are averaged over faces within this distance, in radii of the unit ball, which irons out dents."""
+    """Normals are averaged over the surface within this distance, in radii of the unit ball, which irons out dents."""
     quantile: float = 0.25
     """Which of the colours that a point shows in different photographs counts; low ones leave highlights out."""
     least_views: int = 2
@@ -90,11 +91,11 @@ class ColorGathering:
     def __post_init__(self) -> None:
         if min(self.num_points, self.candidates_per_point, self.least_views) < 1:
             raise UserError("numbers of points and views must be positive", got=str(self))
-        if not 0 <= self.quantile <= 1 or not 0 < self.normal_radius < 1:
+        if not 0 <= self.quantile <= 1 or not 0 < self.normal_radius <= 0.2:
             raise UserError(
                 "the quantile or the radius of normals is out of range",
                 got=f"{self.quantile:g} and {self.normal_radius:g}",
-                wanted="values in [0, 1]",
+                wanted="up to 1 and up to 0.2",
             )
 
 
@@ -122,7 +123,7 @@ def seen_points(
 
 
 def surface_points(mesh: TriangleMesh, count: int, radius: float, generator: np.random.Generator) -> SurfacePoints:
-    """Points spread evenly over the surface, with the mean normal of the faces around each.
+    """Points spread evenly over the surface, with the mean normal of the surface around each.
 
     Args:
         mesh: the object.
@@ -132,25 +133,24 @@ def surface_points(mesh: TriangleMesh, count: int, radius: float, generator: np.
     """
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas = np.linalg.norm(cross, axis=1) / 2
-    face = generator.choice(len(areas), count, p=areas / areas.sum())
-    u, v = np.sqrt(generator.random(count)), generator.random(count)
+    double_areas = np.linalg.norm(cross, axis=1)
+    num_drawn = max(count, _POINTS_FOR_NORMALS)
+    face = generator.choice(len(cross), num_drawn, p=double_areas / double_areas.sum())
+    u, v = np.sqrt(generator.random(num_drawn)), generator.random(num_drawn)
     weights = np.stack([1 - u, u * (1 - v), u * v], -1)
     positions = (corners[face] * weights[..., None]).sum(1)
-    flat = cross / np.maximum(2 * areas, 1e-20)[:, None]
-    normals = _averaged(positions, flat[face], corners.mean(1), cross, radius)
-    return SurfacePoints(positions.astype(np.float32), normals.astype(np.float32))
+    normals = _averaged(positions, cross[face] / double_areas[face, None], radius)
+    return SurfacePoints(positions[:count].astype(np.float32), normals[:count].astype(np.float32))
 
 
-def _averaged(
-    positions: np.ndarray, own: np.ndarray, centres: np.ndarray, weighted: np.ndarray, radius: float
-) -> np.ndarray:
-    """Unit means of the area-weighted normals of faces within `radius` that look the same way as the point's own."""
-    near = cKDTree(centres).query_ball_point(positions, radius)
-    total = own * 1e-9
-    for index, faces in enumerate(near):
-        around = weighted[faces]
-        total[index] += around[around @ own[index] > 0].sum(0)
+def _averaged(positions: np.ndarray, normals: np.ndarray, radius: float) -> np.ndarray:
+    """Unit means of the normals of points within `radius` that look to the same side as the point's own."""
+    first, second = cKDTree(positions).query_pairs(radius, output_type="ndarray").T
+    same_side = (normals[first] * normals[second]).sum(1) > 0
+    first, second = first[same_side], second[same_side]
+    ones, shape = np.ones(len(first)), (len(positions), len(positions))
+    near = csr_matrix((ones, (first, second)), shape=shape)
+    total = normals + near @ normals + near.T @ normals
     return total / np.linalg.norm(total, axis=1, keepdims=True)
 
 
@@ -169,23 +169,20 @@ def seen_colors(
     Returns:
         Linear colours, float32 [points, 3]; NaN where too few photographs see the point, or it is overexposed in them.
     """
-    num_views, num_points = len(views), len(points)
-    pixels, depth = views.cameras.project(points.positions)
-    toward = views.cameras.positions[:, None] - points.positions
-    distance = np.linalg.norm(toward, axis=-1, keepdims=True)
-    toward = toward / np.maximum(distance, 1e-9)
-    cosine = (toward * points.normals).sum(-1)
-    asked = (depth > 0) & (cosine > _LEAST_COSINE) & _is_inside(pixels, views)
-    colors = np.full((num_views, num_points, 3), np.nan, np.float32)
-    for view in range(num_views):
-        index = np.flatnonzero(asked[view])
-        srgb, alpha = _looked_up(views.srgb[view], views.alpha[view], pixels[view, index])
+    colors = np.full((len(views), len(points), 3), np.nan, np.float32)
+    for view in range(len(views)):
+        pixels, depth = (values[0] for values in views.cameras[view].project(points.positions))
+        toward = views.cameras.positions[view] - points.positions
+        toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-9)
+        is_turned = (toward * points.normals).sum(-1) > _LEAST_COSINE
+        index = np.flatnonzero((depth > 0) & is_turned & _is_inside(pixels, views))
+        srgb, alpha = _looked_up(views.srgb[view], views.alpha[view], pixels[index])
         index, srgb = index[alpha > _OPAQUE], srgb[alpha > _OPAQUE]
         starts = points.positions[index] + _OFFSET * points.normals[index]
-        is_free = np.isinf(caster.distances(starts, toward[view, index]))
+        is_free = np.isinf(caster.distances(starts, toward[index]))
         colors[view, index[is_free]] = srgb[is_free]
     enough = np.isfinite(colors[..., 0]).sum(0) >= max(least_views, 1)
-    result = np.full((num_points, 3), np.nan, np.float32)
+    result = np.full((len(points), 3), np.nan, np.float32)
     # colours in sRGB sort as linear ones do
     if enough.any():
         result[enough] = np.nanquantile(colors[:, enough], quantile, axis=0)
