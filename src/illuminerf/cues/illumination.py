@@ -2,15 +2,17 @@
 
 Deviation: not in the paper, which tells the relighting model nothing of the photographs' own light.
 
-A diffuse point shows B = albedo * (T E): T is how much of the radiance E of every direction reaches it, shadows
-included. Of all lights the one is taken under which albedo varies least: log B - log(T E) shall agree between points
-that are near each other and between points anywhere whose colours differ in brightness only. The penalty is robust
-(Geman and McClure), so that edges of paint cost no more than a constant, and starts wide (graduated non-convexity).
-A smooth and not too bright light is preferred. Each channel's gain cannot be known: the light is made neutral, and so
-bright that the lightest paint is nearly white.
+A diffuse point shows B = albedo * (T E + F B): T is how much of the radiance E of every direction reaches it, shadows
+included, and F how much of what other points show. Of all lights the one is taken under which albedo varies least:
+log B - log(T E + F B) shall agree between points that are near each other and between points anywhere whose colours
+differ in brightness only. The penalty is robust (Geman and McClure), so that edges of paint cost no more than a
+constant, and starts wide (graduated non-convexity). Differences of chromaticity count more than those of brightness:
+light changes colour less than paint does. A smooth and even light is preferred. Each channel's gain cannot be known:
+the light is made neutral, and so bright that the lightest paint is nearly white.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -24,6 +26,8 @@ from illuminerf.workflow.errors import UserError
 _DARKEST = 1e-3  # linear; half of the first step of 8-bit sRGB is 1.5e-4
 _NARROWEST_ROW = 0.15
 _CHROMA_STIFFNESS = 2.0  # colour of light varies less than its brightness
+_LIGHTEST_QUANTILE, _LIGHTEST_ALBEDO = 0.95, 0.85
+_DIMMEST_WHITE = 0.2  # linear
 
 
 @dataclass(frozen=True)
@@ -37,30 +41,34 @@ class LightFit:
     pairs_per_point: int = 6
     """Neighbours of each point within each radius."""
     far_pairs_per_point: int = 18
-    """Points anywhere that each point is compared with."""
-    far_weight: float = 1.0
-    """Weight of all far pairs together; that of near pairs is 1."""
-    chroma_width: float = 0.1
-    """Standard deviation, in logarithms, of the difference in chromaticity up to which paints count as the same."""
-    edge_width: float = 0.3
-    """Difference in log albedo above which a pair counts as two paints."""
-    smoothness: float = 0.05
+    """Points anywhere that each point is compared with; all together they weigh as much as all near pairs."""
+    chroma_width: float = 0.3
+    """Difference of chromaticity, in logarithms, at which colours begin to count as those of different paints."""
+    chroma_weight: float = 4.0
+    """How much more differences of chromaticity count than those of brightness."""
+    edge_width: float = 0.2
+    """Difference of log albedo above which a pair counts as two paints."""
+    widening: tuple[float, ...] = (4.0, 2.0, 1.0)
+    """`edge_width` is multiplied by these in the rounds of the fit."""
+    steps_per_round: int = 60
+    """L-BFGS iterations of each round."""
+    dark_level: float = 0.02
+    """Linear level below which colours, more gloss and noise than paint, count little."""
+    smoothness: float = 0.03
     """Weight of the squared differences of log radiance between neighbouring texels."""
     evenness: float = 0.01
     """Weight of the variance of log radiance."""
-    edge_widths: tuple[float, ...] = (4.0, 2.0, 1.0)
-    """The penalty's width in the rounds of the fit, in units of `edge_width`."""
-    steps_per_round: int = 60
-    """L-BFGS iterations of each round."""
+    bounce_rays: int = 64
+    """Rays per point that look for light from other points."""
 
     def __post_init__(self) -> None:
         if not 4 <= self.map_height <= 64:
             raise UserError("map_height is out of range", got=str(self.map_height), wanted="4 to 64")
-        counts = (self.pairs_per_point, self.far_pairs_per_point, self.steps_per_round)
-        if min(counts) < 1 or not self.near_radii or not self.edge_widths:
+        counts = (self.pairs_per_point, self.far_pairs_per_point, self.steps_per_round, self.bounce_rays)
+        if min(counts) < 1 or not self.near_radii or not self.widening:
             raise UserError("the fit of the light needs pairs and steps", wanted="numbers of 1 or more")
-        widths = (self.chroma_width, self.edge_width, *self.near_radii, *self.edge_widths)
-        weights = (self.far_weight, self.smoothness, self.evenness)
+        widths = (self.chroma_width, self.edge_width, *self.near_radii, *self.widening)
+        weights = (self.chroma_weight, self.dark_level, self.smoothness, self.evenness)
         if not all(0 < value < np.inf for value in widths) or not all(0 <= value < np.inf for value in weights):
             raise UserError("a width or weight of the fit of the light is out of range", wanted="positive numbers")
 
@@ -71,7 +79,7 @@ class FittedLight:
 
     Attributes:
         light: linear radiance, scaled as the module's docstring says.
-        shading: float32 [points, 3], T E of that light.
+        shading: float32 [points, 3], T E + F B of that light.
         albedo: float32 [points, 3], colour / shading.
         residual: mean penalty of the pairs: 0 where all albedos agree, 1 where none do.
         explained: share of the variance of log colour that is gone from log albedo; negative where the fit made it
@@ -86,40 +94,49 @@ class FittedLight:
 
 
 def fit_light(
-    points: SurfacePoints, colors: np.ndarray, transport: np.ndarray, config: LightFit, generator: np.random.Generator
+    points: SurfacePoints,
+    colors: np.ndarray,
+    transport: np.ndarray,
+    bounces: csr_matrix,
+    config: LightFit,
+    generator: np.random.Generator,
 ) -> FittedLight:
     """Find the light under which the albedo of points varies least.
 
     Args:
         points: on the surface.
         colors: linear colours of the points, float32 [points, 3].
-        transport: float32 [points, texels] of `light_transport` with `config.map_height` rows.
+        transport: T, float32 [points, texels] of `light_transport` with `config.map_height` rows.
+        bounces: F, [points, points] of `interreflection`.
         config: the settings.
         generator: draws the pairs.
     """
     log_colors = np.log(np.maximum(colors, _DARKEST)).astype(np.float64)
-    pairs = _Pairs.drawn(points.positions, log_colors, config, generator)
+    pairs = Pairs.drawn(points.positions, log_colors, config, generator)
+    indirect = bounces @ colors.astype(np.float64)
     shape = (config.map_height, 2 * config.map_height, 3)
     log_light = np.zeros(shape)
-    for width in config.edge_widths:
+    for widening in config.widening:
+        # light from other points depends on the gain of the light, which is that of the last round
+        direct = _shading(log_light, transport)
+        gain = _gain(direct, colors)
+        unbounced = log_colors - np.log1p(indirect / (gain * direct))
 
-        def loss(flat: np.ndarray, width: float = width * config.edge_width) -> tuple[float, np.ndarray]:
-            value, gradient = light_loss(flat.reshape(shape), log_colors, transport, pairs, width, config)
+        def loss(flat: np.ndarray, width: float = widening * config.edge_width, target: np.ndarray = unbounced) -> Any:
+            value, gradient = light_loss(flat.reshape(shape), target, transport, pairs, width, config)
             return value, gradient.ravel()
 
         options = {"maxiter": config.steps_per_round, "maxcor": 20}
         log_light = minimize(loss, log_light.ravel(), jac=True, method="L-BFGS-B", options=options).x.reshape(shape)
-    residual = pairs.penalty(log_colors - _log_shading(log_light, transport)[0], config.edge_width)[0]
-    radiance = np.exp(log_light - log_light.mean())
-    shading = transport @ radiance.reshape(-1, 3)
-    gain = _gain(shading, colors)
-    shading = np.maximum(shading * gain, _DARKEST)
+    direct = _shading(log_light, transport)
+    gain = _gain(direct, colors)
+    shading = gain * direct + indirect
     log_albedo = log_colors - np.log(shading)
     return FittedLight(
-        EnvironmentMap((radiance * gain).astype(np.float32), "estimated"),
+        EnvironmentMap((np.exp(log_light) * gain).astype(np.float32), "estimated"),
         shading.astype(np.float32),
         np.exp(log_albedo).astype(np.float32),
-        float(residual),
+        pairs.penalty(log_albedo, config.edge_width)[0],
         float(1 - log_albedo.var(0).sum() / max(log_colors.var(0).sum(), 1e-12)),
     )
 
@@ -130,46 +147,57 @@ def uniform_light(height: int) -> EnvironmentMap:
 
 
 def _gain(shading: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Per channel, float [3]: mean log shading grey, and the lightest paints almost white."""
-    neutral = np.exp(-np.log(np.maximum(shading, _DARKEST)).mean(0))
-    albedo = colors / np.maximum(shading * neutral, _DARKEST)
-    return neutral * np.quantile(albedo.mean(-1), 0.95) / 0.85
+    """Per channel, float [3]: mean log shading grey, and the lightest paints almost white, unless white would then
+    look dark in the photographs: nobody exposes like that, the object is dark."""
+    neutral = np.exp(-np.log(shading).mean(0))
+    white = shading * neutral
+    lightest = np.quantile((colors / white).mean(-1), _LIGHTEST_QUANTILE)
+    return neutral * max(lightest / _LIGHTEST_ALBEDO, _DIMMEST_WHITE / white.mean())
 
 
 @dataclass(frozen=True)
-class _Pairs:
+class Pairs:
     """Weighted pairs of points whose paint may be the same."""
 
     difference: csr_matrix
     """[pairs, points], 1 and -1 in every row."""
     weights: np.ndarray
     """[pairs], sum 1."""
+    mixing: np.ndarray
+    """[3, 3], weights of brightness and chromaticity."""
 
     @staticmethod
     def drawn(
         positions: np.ndarray, log_colors: np.ndarray, config: LightFit, generator: np.random.Generator
-    ) -> "_Pairs":
+    ) -> "Pairs":
         num_points = len(positions)
         near = _near_pairs(positions, config, generator)
         first = np.repeat(np.arange(num_points), config.far_pairs_per_point)
         far = np.stack([first, generator.integers(0, num_points, len(first))], -1)
         index = np.concatenate([near, far])
-        share = np.where(np.arange(len(index)) < len(near), 1 / max(len(near), 1), config.far_weight / len(far))
         chroma = log_colors - log_colors.mean(1, keepdims=True)
         distance = np.square(chroma[index[:, 0]] - chroma[index[:, 1]]).sum(1)
-        weights = share * np.exp(-0.5 * distance / config.chroma_width**2)
+        level = np.exp(log_colors).mean(1)
+        trust = level / (level + config.dark_level)
+        weights = np.exp(-0.5 * distance / config.chroma_width**2) * trust[index].prod(1)
+        weights *= np.where(np.arange(len(index)) < len(near), 1 / len(near), 1 / len(far))
         rows = np.repeat(np.arange(len(index)), 2)
         signs = np.tile([1.0, -1.0], len(index))
         difference = csr_matrix((signs, (rows, index.ravel())), shape=(len(index), num_points))
-        return _Pairs(difference, weights / weights.sum())
+        return Pairs(difference, weights / weights.sum(), _mixing(1.0, config.chroma_weight))
 
     def penalty(self, log_albedo: np.ndarray, width: float) -> tuple[float, np.ndarray]:
         """Geman-McClure penalty of the differences of log albedo [points, 3], and its gradient."""
-        gap = self.difference @ log_albedo
+        gap = self.difference @ (log_albedo @ self.mixing)
         square = np.square(gap).mean(1) + width**2
-        value = 1 - width**2 / square
         slope = gap * (self.weights * (2 / 3) * width**2 / np.square(square))[:, None]
-        return float(self.weights @ value), self.difference.T @ slope
+        return float(self.weights @ (1 - width**2 / square)), (self.difference.T @ slope) @ self.mixing
+
+
+def _mixing(grey_weight: float, chroma_weight: float) -> np.ndarray:
+    """Symmetric float [3, 3] that weights the mean of three channels and what differs from it."""
+    grey = np.full((3, 3), 1 / 3)
+    return grey_weight * grey + chroma_weight * (np.eye(3) - grey)
 
 
 def _near_pairs(positions: np.ndarray, config: LightFit, generator: np.random.Generator) -> np.ndarray:
@@ -187,28 +215,27 @@ def light_loss(
     log_light: np.ndarray,
     log_colors: np.ndarray,
     transport: np.ndarray,
-    pairs: _Pairs,
+    pairs: Pairs,
     width: float,
     config: LightFit,
 ) -> tuple[float, np.ndarray]:
     """What the fit minimises, and its gradient by `log_light` [height, width, 3]."""
-    log_shading, shading = _log_shading(log_light, transport)
-    value, by_albedo = pairs.penalty(log_colors - log_shading, width)
-    by_radiance = transport.T @ (-by_albedo / (shading + _DARKEST)).astype(np.float32)
+    shading = _shading(log_light, transport)
+    value, by_albedo = pairs.penalty(log_colors - np.log(shading), width)
+    by_radiance = transport.T @ (-by_albedo / shading).astype(np.float32)
     prior, by_prior = _prior(log_light, config)
     return value + prior, by_radiance.reshape(log_light.shape) * np.exp(log_light) + by_prior
 
 
-def _log_shading(log_light: np.ndarray, transport: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    shading = (transport @ np.exp(log_light).reshape(-1, 3).astype(np.float32)).astype(np.float64)
-    return np.log(shading + _DARKEST), shading
+def _shading(log_light: np.ndarray, transport: np.ndarray) -> np.ndarray:
+    """Float64 [points, 3], a little above 0 also where no light comes."""
+    return (transport @ np.exp(log_light).reshape(-1, 3).astype(np.float32)).astype(np.float64) + _DARKEST
 
 
 def _prior(log_light: np.ndarray, config: LightFit) -> tuple[float, np.ndarray]:
     """Smoothness over angles and evenness of log radiance, stiffer for its chromaticity; and the gradient."""
     height = len(log_light)
-    grey = np.full((3, 3), 1 / 3)
-    mixing = grey / np.sqrt(3) + _CHROMA_STIFFNESS * (np.eye(3) - grey)
+    mixing = _mixing(3**-0.5, _CHROMA_STIFFNESS)
     mixed = (log_light - log_light.mean()) @ mixing
     cosine = np.cos((0.5 - (np.arange(height) + 0.5) / height) * np.pi)
     across = 1 / np.maximum(cosine, _NARROWEST_ROW)[:, None, None]

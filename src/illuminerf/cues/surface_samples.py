@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from illuminerf.cues.mitsuba_scene import mitsuba_mesh
@@ -16,13 +17,14 @@ from illuminerf.workflow.errors import UserError
 
 _RAYS_PER_PASS = 2**20
 _OFFSET = 4e-3  # of the unit ball: rays start this far above the surface, beyond its dents
+_POINTS_FOR_NORMALS = 30_000
 _LEAST_COSINE = 0.2  # photographs that see a point at a flatter angle are not asked
 _OPAQUE = 0.98
 _CLIPPED_SRGB = 0.985
 
 
-class OcclusionTest:
-    """Whether rays hit a mesh.
+class RayCaster:
+    """Where rays hit a mesh.
 
     Args:
         mesh: the object.
@@ -34,23 +36,22 @@ class OcclusionTest:
         shape = mitsuba_mesh(self._mitsuba, "mesh", mesh.vertices, mesh.faces, {"type": "diffuse"})
         self._scene: Any = self._mitsuba.load_dict({"type": "scene", "mesh": shape})
 
-    def is_blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Bool [rays] for rays that never end, float [rays, 3] each; directions are unit."""
+    def distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """How far rays go, float32 [rays], infinite where they hit nothing; origins and unit directions [rays, 3]."""
         mi, is_scalar = self._mitsuba, self._mitsuba.variant().startswith("scalar")
-        blocked = np.zeros(len(origins), bool)
+        found = np.zeros(len(origins), np.float32)
         for first in range(0, len(origins), _RAYS_PER_PASS):
             part = slice(first, first + _RAYS_PER_PASS)
             starts, toward = (np.ascontiguousarray(a[part], np.float32) for a in (origins, directions))
             if is_scalar:
-                rays = (
-                    mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
-                    for o, d in zip(starts.tolist(), toward.tolist(), strict=True)
-                )
-                blocked[part] = [self._scene.ray_test(ray) for ray in rays]
+                rays = zip(starts.tolist(), toward.tolist(), strict=True)
+                found[part] = [self._distance(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))) for o, d in rays]
             else:
-                ray = mi.Ray3f(mi.Point3f(*starts.T), mi.Vector3f(*toward.T))
-                blocked[part] = np.array(self._scene.ray_test(ray))
-        return blocked
+                found[part] = self._distance(mi.Ray3f(mi.Point3f(*starts.T), mi.Vector3f(*toward.T)))
+        return found
+
+    def _distance(self, ray: Any) -> Any:
+        return self._scene.ray_intersect_preliminary(ray).t
 
 
 @dataclass(frozen=True)
@@ -80,8 +81,8 @@ class ColorGathering:
     """Points to keep."""
     candidates_per_point: int = 3
     """Points drawn for every one to keep; those that photographs do not show well are dropped."""
-    normal_radius: float = 0.03
-    """Normals are averaged over faces within this distance, in radii of the unit ball, which irons out dents."""
+    normal_radius: float = 0.05
+    """Normals are averaged over the surface within this distance, in radii of the unit ball, which irons out dents."""
     quantile: float = 0.25
     """Which of the colours that a point shows in different photographs counts; low ones leave highlights out."""
     least_views: int = 2
@@ -90,18 +91,18 @@ class ColorGathering:
     def __post_init__(self) -> None:
         if min(self.num_points, self.candidates_per_point, self.least_views) < 1:
             raise UserError("numbers of points and views must be positive", got=str(self))
-        if not 0 <= self.quantile <= 1 or not 0 < self.normal_radius < 1:
+        if not 0 <= self.quantile <= 1 or not 0 < self.normal_radius <= 0.2:
             raise UserError(
                 "the quantile or the radius of normals is out of range",
                 got=f"{self.quantile:g} and {self.normal_radius:g}",
-                wanted="values in [0, 1]",
+                wanted="up to 1 and up to 0.2",
             )
 
 
 def seen_points(
     mesh: TriangleMesh,
     views: Views,
-    occlusion: OcclusionTest,
+    caster: RayCaster,
     config: ColorGathering,
     generator: np.random.Generator,
 ) -> tuple[SurfacePoints, np.ndarray]:
@@ -110,19 +111,19 @@ def seen_points(
     Args:
         mesh: the object in the world of the cameras.
         views: photographs.
-        occlusion: of the same mesh.
+        caster: of the same mesh.
         config: the settings.
         generator: draws the points.
     """
     count = config.num_points * config.candidates_per_point
     candidates = surface_points(mesh, count, config.normal_radius, generator)
-    colors = seen_colors(candidates, views, occlusion, config.quantile, min(config.least_views, len(views)))
+    colors = seen_colors(candidates, views, caster, config.quantile, min(config.least_views, len(views)))
     kept = np.flatnonzero(np.isfinite(colors).all(-1))[: config.num_points]
     return candidates[kept], colors[kept]
 
 
 def surface_points(mesh: TriangleMesh, count: int, radius: float, generator: np.random.Generator) -> SurfacePoints:
-    """Points spread evenly over the surface, with the mean normal of the faces around each.
+    """Points spread evenly over the surface, with the mean normal of the surface around each.
 
     Args:
         mesh: the object.
@@ -132,60 +133,56 @@ def surface_points(mesh: TriangleMesh, count: int, radius: float, generator: np.
     """
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas = np.linalg.norm(cross, axis=1) / 2
-    face = generator.choice(len(areas), count, p=areas / areas.sum())
-    u, v = np.sqrt(generator.random(count)), generator.random(count)
+    double_areas = np.linalg.norm(cross, axis=1)
+    num_drawn = max(count, _POINTS_FOR_NORMALS)
+    face = generator.choice(len(cross), num_drawn, p=double_areas / double_areas.sum())
+    u, v = np.sqrt(generator.random(num_drawn)), generator.random(num_drawn)
     weights = np.stack([1 - u, u * (1 - v), u * v], -1)
     positions = (corners[face] * weights[..., None]).sum(1)
-    flat = cross / np.maximum(2 * areas, 1e-20)[:, None]
-    normals = _averaged(positions, flat[face], corners.mean(1), cross, radius)
-    return SurfacePoints(positions.astype(np.float32), normals.astype(np.float32))
+    normals = _averaged(positions, cross[face] / double_areas[face, None], radius)
+    return SurfacePoints(positions[:count].astype(np.float32), normals[:count].astype(np.float32))
 
 
-def _averaged(
-    positions: np.ndarray, own: np.ndarray, centres: np.ndarray, weighted: np.ndarray, radius: float
-) -> np.ndarray:
-    """Unit means of the area-weighted normals of faces within `radius` that look the same way as the point's own."""
-    near = cKDTree(centres).query_ball_point(positions, radius)
-    total = own * 1e-9
-    for index, faces in enumerate(near):
-        around = weighted[faces]
-        total[index] += around[around @ own[index] > 0].sum(0)
+def _averaged(positions: np.ndarray, normals: np.ndarray, radius: float) -> np.ndarray:
+    """Unit means of the normals of points within `radius` that look to the same side as the point's own."""
+    first, second = cKDTree(positions).query_pairs(radius, output_type="ndarray").T
+    same_side = (normals[first] * normals[second]).sum(1) > 0
+    first, second = first[same_side], second[same_side]
+    ones, shape = np.ones(len(first)), (len(positions), len(positions))
+    near = csr_matrix((ones, (first, second)), shape=shape)
+    total = normals + near @ normals + near.T @ normals
     return total / np.linalg.norm(total, axis=1, keepdims=True)
 
 
 def seen_colors(
-    points: SurfacePoints, views: Views, occlusion: OcclusionTest, quantile: float, least_views: int
+    points: SurfacePoints, views: Views, caster: RayCaster, quantile: float, least_views: int
 ) -> np.ndarray:
     """What photographs show at points.
 
     Args:
         points: on the surface.
         views: photographs.
-        occlusion: of the same mesh.
+        caster: of the same mesh.
         quantile: which of the colours that different photographs show, per channel: low ones leave highlights out.
         least_views: points seen by fewer are left out.
 
     Returns:
         Linear colours, float32 [points, 3]; NaN where too few photographs see the point, or it is overexposed in them.
     """
-    num_views, num_points = len(views), len(points)
-    pixels, depth = views.cameras.project(points.positions)
-    toward = views.cameras.positions[:, None] - points.positions
-    distance = np.linalg.norm(toward, axis=-1, keepdims=True)
-    toward = toward / np.maximum(distance, 1e-9)
-    cosine = (toward * points.normals).sum(-1)
-    asked = (depth > 0) & (cosine > _LEAST_COSINE) & _is_inside(pixels, views)
-    colors = np.full((num_views, num_points, 3), np.nan, np.float32)
-    for view in range(num_views):
-        index = np.flatnonzero(asked[view])
-        srgb, alpha = _looked_up(views.srgb[view], views.alpha[view], pixels[view, index])
+    colors = np.full((len(views), len(points), 3), np.nan, np.float32)
+    for view in range(len(views)):
+        pixels, depth = (values[0] for values in views.cameras[view].project(points.positions))
+        toward = views.cameras.positions[view] - points.positions
+        toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-9)
+        is_turned = (toward * points.normals).sum(-1) > _LEAST_COSINE
+        index = np.flatnonzero((depth > 0) & is_turned & _is_inside(pixels, views))
+        srgb, alpha = _looked_up(views.srgb[view], views.alpha[view], pixels[index])
         index, srgb = index[alpha > _OPAQUE], srgb[alpha > _OPAQUE]
         starts = points.positions[index] + _OFFSET * points.normals[index]
-        is_free = ~occlusion.is_blocked(starts, toward[view, index])
+        is_free = np.isinf(caster.distances(starts, toward[index]))
         colors[view, index[is_free]] = srgb[is_free]
     enough = np.isfinite(colors[..., 0]).sum(0) >= max(least_views, 1)
-    result = np.full((num_points, 3), np.nan, np.float32)
+    result = np.full((len(points), 3), np.nan, np.float32)
     # colours in sRGB sort as linear ones do
     if enough.any():
         result[enough] = np.nanquantile(colors[:, enough], quantile, axis=0)
@@ -212,12 +209,12 @@ def _looked_up(srgb: np.ndarray, alpha: np.ndarray, pixels: np.ndarray) -> tuple
     return value[:, :3], value[:, 3]
 
 
-def light_transport(points: SurfacePoints, occlusion: OcclusionTest, height: int) -> np.ndarray:
+def light_transport(points: SurfacePoints, caster: RayCaster, height: int) -> np.ndarray:
     """Diffuse shading per radiance of every texel of an equirectangular map, without interreflections.
 
     Args:
         points: on the surface.
-        occlusion: of the same mesh.
+        caster: of the same mesh.
         height: rows of the map.
 
     Returns:
@@ -229,7 +226,30 @@ def light_transport(points: SurfacePoints, occlusion: OcclusionTest, height: int
     cosine = points.normals @ directions.T
     point, texel = np.nonzero(cosine > 0)
     starts = points.positions[point] + _OFFSET * points.normals[point]
-    is_blocked = occlusion.is_blocked(starts, directions[texel])
+    is_free = np.isinf(caster.distances(starts, directions[texel]))
     transport = np.zeros(cosine.shape, np.float32)
-    transport[point, texel] = np.where(is_blocked, 0, cosine[point, texel] * solid_angles[texel] / np.pi)
+    transport[point, texel] = np.where(is_free, cosine[point, texel] * solid_angles[texel] / np.pi, 0)
     return transport
+
+
+def interreflection(
+    points: SurfacePoints, caster: RayCaster, rays_per_point: int, generator: np.random.Generator
+) -> csr_matrix:
+    """Diffuse shading per radiance of the other points, [points, points]; rows sum to what a point sees of the mesh.
+
+    Args:
+        points: on the surface; what a ray hits counts as the nearest of them.
+        caster: of the same mesh.
+        rays_per_point: cosine-weighted directions to look into.
+        generator: draws them.
+    """
+    num_points = len(points)
+    directions = generator.normal(size=(num_points, rays_per_point, 3))
+    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True) + points.normals[:, None]
+    directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).reshape(-1, 3)
+    starts = np.repeat(points.positions + _OFFSET * points.normals, rays_per_point, 0)
+    distance = caster.distances(starts, directions)
+    hit = np.flatnonzero(np.isfinite(distance))
+    seen = cKDTree(points.positions).query(starts[hit] + distance[hit, None] * directions[hit])[1]
+    shares = np.full(len(hit), 1 / rays_per_point)
+    return csr_matrix((shares, (hit // rays_per_point, seen)), shape=(num_points, num_points))

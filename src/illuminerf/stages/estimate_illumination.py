@@ -16,7 +16,7 @@ import numpy as np
 
 from illuminerf.cues.illumination import LightFit, fit_light, uniform_light
 from illuminerf.cues.renderer import CueSampling, render_cues
-from illuminerf.cues.surface_samples import ColorGathering, OcclusionTest, light_transport, seen_points
+from illuminerf.cues.surface_samples import ColorGathering, RayCaster, interreflection, light_transport, seen_points
 from illuminerf.data.capture import load_capture
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import linear_from_srgb, read_exr, srgb_from_linear, write_exr, write_png
@@ -94,9 +94,9 @@ def estimated_light(mesh: TriangleMesh, views: Views, config: Config) -> tuple[E
         views: photographs under one light.
         config: the settings; `sampling.device` finds shadows.
     """
-    occlusion = OcclusionTest(mesh, config.sampling.device)
+    caster = RayCaster(mesh, config.sampling.device)
     generator = numpy_generator(config.seed, "points")
-    points, colors = seen_points(mesh, views, occlusion, config.gathering, generator)
+    points, colors = seen_points(mesh, views, caster, config.gathering, generator)
     metrics: dict[str, Any] = {"num_points": len(points), "is_fallback": len(points) < _LEAST_POINTS}
     if metrics["is_fallback"]:
         say(
@@ -105,8 +105,9 @@ def estimated_light(mesh: TriangleMesh, views: Views, config: Config) -> tuple[E
             "together."
         )
         return uniform_light(config.fit.map_height), {**metrics, "residual": 1.0, "explained": 0.0}
-    transport = light_transport(points, occlusion, config.fit.map_height)
-    fitted = fit_light(points, colors, transport, config.fit, numpy_generator(config.seed, "pairs"))
+    transport = light_transport(points, caster, config.fit.map_height)
+    bounces = interreflection(points, caster, config.fit.bounce_rays, numpy_generator(config.seed, "bounces"))
+    fitted = fit_light(points, colors, transport, bounces, config.fit, numpy_generator(config.seed, "pairs"))
     say(f"illumination: shading explains {fitted.explained:.0%} of the variance of log colour at {len(points)} points")
     return fitted.light, {**metrics, "residual": fitted.residual, "explained": fitted.explained}
 
