@@ -85,7 +85,7 @@ def latent_weight(alpha: Float[Tensor, "batch 1 height width"], block: int, outs
 class LossWeights:
     """How the terms are added."""
 
-    anchor: float = 1.0
+    anchor: float = 10.0
     """Squared sRGB error of the composited products, per covered pixel."""
     rescaled_anchor: float = 1.0
     """Logarithm of each image's mean squared error after the least-squares gain per image and channel, which is what

@@ -29,7 +29,6 @@ from illuminerf.diffusion.relighter import Relighter
 from illuminerf.diffusion.sampling import Sampler
 from illuminerf.scene.images import read_exr, write_png
 from illuminerf.scene.views import Views
-from illuminerf.stages.estimate_illumination import shading_path
 from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.device import Precision, autocast, derived_seed, resolve_device
@@ -202,7 +201,7 @@ def _photograph(sources: _Sources, view: int, device: torch.device) -> Photograp
     cues = _straight(sources.cues / "cues" / f"{view:03d}.exr", CUE_CHANNELS, alpha.shape)
     shading = np.zeros((3, *alpha.shape), np.float32)
     if sources.illumination is not None:
-        shading = _straight(shading_path(sources.illumination, view), "RGB", alpha.shape)
+        shading = _straight(sources.illumination / "shading" / f"{view:03d}.exr", "RGB", alpha.shape)
     masked = np.concatenate([sources.views.srgb[view] * alpha[..., None], alpha[..., None]], -1)
     return Photograph(
         torch.from_numpy(np.ascontiguousarray(masked.transpose(2, 0, 1))).float().to(device),
