@@ -13,11 +13,9 @@ from illuminerf.diffusion.pretrained import pretrained_model
 from illuminerf.diffusion.relighting_scores import evaluate, held_out_pairs
 from illuminerf.diffusion.sampling import Sampler
 from illuminerf.diffusion.training_items import load_items
-from illuminerf.evaluation.benchmark_rule import on_white
 from illuminerf.evaluation.tables import cell_table, published_table
 from illuminerf.presets import DILIGHTNET, EMBEDDED, Preset, customised
-from illuminerf.scene.images import read_png, write_png
-from illuminerf.stages.score_predictions import score_input_light, score_predictions
+from illuminerf.stages.score_predictions import score_input_light, score_predictions, write_predictions
 from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.device import resolve_device
 from illuminerf.workflow.errors import UserError
@@ -157,10 +155,8 @@ def relight_scene(
     jobs = [pipeline.LightJob(_light(lights_dir, light), test_cameras) for light in lights]
     pipeline.relight(scene, jobs, preset, out / scene.name)
     for light in lights:
-        rendered = out / scene.name / "lights" / light / "test_views" / "images"
-        for view, name in enumerate(names):
-            image = read_png(rendered / f"{view:03d}.png")
-            write_png(out / "predictions" / scene.name / light / f"{name}.png", on_white(image))
+        rendered = out / scene.name / "lights" / light / "test_views"
+        write_predictions(rendered, names, out / "predictions" / scene.name / light)
 
 
 def _light(folder: Path, name: str) -> Path:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar
 import tyro
 from rich.markup import escape
 
-from illuminerf import benchmark, demo, models, pipeline
+from illuminerf import ablation, benchmark, demo, models, pipeline
 from illuminerf.data.objaverse_download import download_objaverse
 from illuminerf.data.object_collection import read_ids
 from illuminerf.presets import PRESETS, Preset, customised
@@ -269,7 +269,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     ),
 }
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
-    "benchmark": {"tensoir": benchmark.tensoir_command},
+    "benchmark": {"tensoir": benchmark.tensoir_command, "ablation": ablation.ablation_command},
     "data": {
         "preview": preview_command,
         "download-objaverse": download_objaverse_command,

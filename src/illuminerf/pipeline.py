@@ -71,12 +71,9 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
     """
     _check(jobs)
     check_model(preset.relighting_model)
-    capture = import_capture.run(source, preset.capture, out / "capture")
-    geometry = estimate_geometry.run(capture, preset.geometry, out / "geometry")
+    shared = estimate_object(source, preset, out)
+    capture, geometry, illumination = shared["capture"], shared["geometry"], shared.get("illumination")
     _copy(geometry / "mesh.glb", out / "mesh.glb")
-    illumination = None
-    if preset.illumination is not None:
-        illumination = estimate_illumination.run(geometry, capture, preset.illumination, out / "illumination")
     lights: dict[str, dict[str, Path]] = {}
     scores: dict[str, Any] = {}
     for job in jobs:
@@ -84,7 +81,7 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
         folder = out / "lights" / job.name
         made = lights[job.name] = relight_under(capture, geometry, illumination, job.light, preset, folder)
         if job.test_cameras is not None:
-            cameras = _in_unit_ball(job.test_cameras, capture, folder / "test_cameras.json")
+            cameras = in_unit_ball(job.test_cameras, capture, folder / "test_cameras.json")
             made["test_views"] = render_novel_views.run(
                 made["latent_nerf"], cameras, preset.test_views, folder / "test_views"
             )
@@ -95,11 +92,19 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
             scores[job.name] = read_metrics(made["scores"])
     first = lights[jobs[0].name]
     _copy(first["video"], out / "turntable.mp4")
-    shared = {"capture": capture, "geometry": geometry}
-    if illumination is not None:
-        shared["illumination"] = illumination
     write_report(out / "report.html", out, shared, lights, scores)
     return scores
+
+
+def estimate_object(source: Path, preset: Preset, out: Path) -> dict[str, Path]:
+    """The half of the method that no target light changes: capture, geometry and, where the preset has it, the
+    photographs' own illumination."""
+    capture = import_capture.run(source, preset.capture, out / "capture")
+    geometry = estimate_geometry.run(capture, preset.geometry, out / "geometry")
+    shared = {"capture": capture, "geometry": geometry}
+    if preset.illumination is not None:
+        shared["illumination"] = estimate_illumination.run(geometry, capture, preset.illumination, out / "illumination")
+    return shared
 
 
 def relight_under(
@@ -146,7 +151,7 @@ def _check(jobs: Sequence[LightJob]) -> None:
         EnvironmentMap.load(job.light)
 
 
-def _in_unit_ball(cameras: Path, capture: Path, out: Path) -> Path:
+def in_unit_ball(cameras: Path, capture: Path, out: Path) -> Path:
     """Write cameras of the caller's world as cameras of the capture's unit ball."""
     moved = load_capture(capture).unit_ball_cameras(Cameras.from_dict(read_json(cameras)))
     write_json(out, moved.to_dict())

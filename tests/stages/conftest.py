@@ -6,10 +6,33 @@ import numpy as np
 import pytest
 
 from illuminerf.data.capture import write_capture
+from illuminerf.fields.appearance import AppearanceConfig
 from illuminerf.fields.bounds import ball_interval
+from illuminerf.fields.hash_grid import HashGridConfig
+from illuminerf.fields.optimisation import OptimiserConfig
+from illuminerf.fields.proposal_sampling import ProposalConfig
+from illuminerf.fields.radiance_field import FieldConfig
+from illuminerf.fields.surface import SurfaceConfig
 from illuminerf.scene.cameras import Cameras, sphere_cameras
+from illuminerf.stages import estimate_geometry
 
 RADIUS = 0.6
+_GRID = HashGridConfig(5, 2, 12, 8, 48)
+_GEOMETRY = estimate_geometry.Config(
+    radiance_field=FieldConfig(
+        SurfaceConfig(_GRID, 32, HashGridConfig(4, 2, 11, 8, 32), 16, initial_beta=0.01),
+        AppearanceConfig(_GRID, 8, 32, 1, 2, 4, 16),
+        ProposalConfig(HashGridConfig(3, 2, 10, 8, 24), 8),
+        num_proposal_samples=16,
+        num_samples=10,
+    ),
+    optimiser=OptimiserConfig(num_steps=120, rays_per_step=128, warmup_steps=10),
+    occupancy_side=32,
+    mesh_resolution=32,
+    num_held_out_views=0,
+    num_previews=0,
+    device="cpu",
+)
 
 
 def sphere_cameras_of(num_views: int, size: int = 40, seed: int = 0) -> Cameras:
@@ -39,3 +62,9 @@ def write_sphere_capture(folder: Path, num_views: int = 12, size: int = 40) -> P
 def sphere_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """12 views of 40 x 40 pixels of a sphere of radius 0.6."""
     return write_sphere_capture(tmp_path_factory.mktemp("sphere") / "capture")
+
+
+@pytest.fixture(scope="session")
+def sphere_geometry(sphere_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short fit to it."""
+    return estimate_geometry.run(sphere_capture, _GEOMETRY, tmp_path_factory.mktemp("fit") / "geometry")

@@ -9,33 +9,12 @@ import pytest
 
 from illuminerf.data.capture import load_capture
 from illuminerf.fields import optimisation
-from illuminerf.fields.appearance import AppearanceConfig
-from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.optimisation import OptimiserConfig
-from illuminerf.fields.proposal_sampling import ProposalConfig
-from illuminerf.fields.radiance_field import FieldConfig
-from illuminerf.fields.surface import SurfaceConfig
 from illuminerf.scene.images import read_png, write_png
-from illuminerf.stages import estimate_geometry, fit_latent_nerf, render_novel_views
+from illuminerf.stages import fit_latent_nerf, render_novel_views
 from illuminerf.workflow.artefact import read_metrics
 from illuminerf.workflow.errors import UserError
 
-_GRID = HashGridConfig(5, 2, 12, 8, 48)
-_GEOMETRY = estimate_geometry.Config(
-    radiance_field=FieldConfig(
-        SurfaceConfig(_GRID, 32, HashGridConfig(4, 2, 11, 8, 32), 16, initial_beta=0.01),
-        AppearanceConfig(_GRID, 8, 32, 1, 2, 4, 16),
-        ProposalConfig(HashGridConfig(3, 2, 10, 8, 24), 8),
-        num_proposal_samples=16,
-        num_samples=10,
-    ),
-    optimiser=OptimiserConfig(num_steps=120, rays_per_step=128, warmup_steps=10),
-    occupancy_side=32,
-    mesh_resolution=32,
-    num_held_out_views=0,
-    num_previews=0,
-    device="cpu",
-)
 CONFIG = fit_latent_nerf.Config(
     optimiser=OptimiserConfig(num_steps=250, rays_per_step=256, warmup_steps=10, checkpoint_every=100),
     device="cpu",
@@ -44,8 +23,8 @@ _GAINS = (0.6, 1.0, 1.4)
 
 
 @pytest.fixture(scope="module")
-def geometry(sphere_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return estimate_geometry.run(sphere_capture, _GEOMETRY, tmp_path_factory.mktemp("fit") / "geometry")
+def geometry(sphere_geometry: Path) -> Path:
+    return sphere_geometry
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +49,16 @@ def test_codes_explain_what_one_appearance_cannot(
     plain = replace(CONFIG, use_latents=False)
     without = fit_latent_nerf.run(geometry, sphere_capture, relit, plain, tmp_path / "plain")
     assert read_metrics(latent_nerf)["train_psnr"] > read_metrics(without)["train_psnr"] + 3
+
+
+def test_shuffled_codes_explain_nothing(
+    geometry: Path, sphere_capture: Path, relit: Path, latent_nerf: Path, tmp_path: Path
+) -> None:
+    shuffled = replace(CONFIG, shuffles_latents=True)
+    out = fit_latent_nerf.run(geometry, sphere_capture, relit, shuffled, tmp_path / "shuffled")
+    assert read_metrics(out)["train_psnr"] < read_metrics(latent_nerf)["train_psnr"] - 3
+    with pytest.raises(UserError, match="no codes to shuffle"):
+        replace(shuffled, use_latents=False)
 
 
 def _brightness(field: Path, sphere_capture: Path, latent_index: int | None, out: Path) -> float:

@@ -51,6 +51,33 @@ TENSOIR = (
     PublishedScores("NeRFactor", 23.383, 0.908, 0.131, _ILLUMINERF, "RTX 2080 Ti, > 100 h"),
 )
 
+
+@dataclass(frozen=True)
+class PublishedAblation:
+    """One row of the paper's ablation: TensoIR's hotdog, 200 views under each of five lights."""
+
+    num_samples: int
+    """Samples per photograph, S."""
+    uses_latents: bool
+    """False: a standard NeRF."""
+    psnr: float
+    ssim: float
+    lpips: float
+
+
+ABLATION = (
+    PublishedAblation(1, False, 24.957, 0.921, 0.099),
+    PublishedAblation(1, True, 26.321, 0.925, 0.097),
+    PublishedAblation(4, True, 27.409, 0.936, 0.087),
+    PublishedAblation(16, True, 27.950, 0.939, 0.082),
+)
+
+
+def published_ablation(num_samples: int, uses_latents: bool) -> PublishedAblation | None:
+    """The paper's row with these settings, where it has one."""
+    return next((row for row in ABLATION if (row.num_samples, row.uses_latents) == (num_samples, uses_latents)), None)
+
+
 STANFORD_ORB = (
     PublishedOrbScores("DiffReg-PBIR", 27.22, 34.98, 0.981, 0.021, "reported by later work on Stanford-ORB"),
     PublishedOrbScores("ROGR", 26.21, 32.91, 0.980, 0.027, _ROGR),

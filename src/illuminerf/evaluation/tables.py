@@ -1,6 +1,7 @@
 """Score tables for a terminal: ours first, published figures marked as such."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -68,6 +69,30 @@ def published_table(psnr: float, ssim: float, lpips: float | None, covers: str) 
     for row in TENSOIR:
         note = f"{row.source}; {row.note}" if row.note else row.source
         table.add_row(f"{row.method} *", *_numbers([row.psnr], 2), *_numbers([row.ssim, row.lpips], 3), note)
+    return table
+
+
+def ablation_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """One row per latent NeRF, as ablation.json has them, beside the paper's figures for TensoIR's hotdog."""
+    table = Table(title="Ablation (marked *: published for TensoIR's hotdog, 200 views under each of 5 lights)")
+    for heading in ("S", "codes"):
+        table.add_column(heading)
+    ours = ("PSNR", "SSIM", "LPIPS", "train PSNR", "samples differ", "renderings differ", "seconds")
+    for heading in (*ours, "PSNR *", "SSIM *", "LPIPS *"):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        codes = "no" if not row["uses_latents"] else "shuffled" if row["shuffles_latents"] else "yes"
+        agreement, published = row["consistency"], row["published"] or {}
+        table.add_row(
+            str(row["num_samples"]),
+            codes,
+            *_numbers([row.get("psnr")], 2),
+            *_numbers([row.get("ssim"), row.get("lpips")], 3),
+            *_numbers([row["train_psnr"]], 2),
+            *_numbers([agreement["samples"], agreement["renderings"]], 4),
+            *_numbers([row["seconds"]], 0),
+            *_numbers([published.get("psnr"), published.get("ssim"), published.get("lpips")], 3),
+        )
     return table
 
 

@@ -37,6 +37,9 @@ class Config:
     """Pixels that are trained on, drawn at random over all views; each is cached once and seen in every sample."""
     use_latents: bool = True
     """One latent code per relit image; False is the paper's ablation, a standard NeRF."""
+    shuffles_latents: bool = False
+    """At every step each image gets the code of another one, drawn at random, so that codes can explain nothing: a
+    check that they do explain something otherwise."""
     latent_penalty: float = 1e-4
     """Weight of the mean squared norm of the latent codes."""
     seed: int = 0
@@ -47,6 +50,8 @@ class Config:
     def __post_init__(self) -> None:
         if min(self.num_kept, self.max_rays) < 1 or self.latent_penalty < 0:
             raise UserError("num_kept and max_rays must be positive, the penalty not negative", got=str(self))
+        if self.shuffles_latents and not self.use_latents:
+            raise UserError("there are no codes to shuffle", got="use_latents false", fix="leave shuffles_latents out")
 
     @classmethod
     def paper(cls) -> "Config":
@@ -163,7 +168,11 @@ def _fit(
         target = (targets[sample, index].float() / 255 * to_opacity[index]).clamp_max(1)
         latents = None
         if config.use_latents:
-            latents = functional.embedding(pool.view[index] * num_samples + sample, model.latents)
+            image = pool.view[index] * num_samples + sample
+            if config.shuffles_latents:
+                others = torch.randint(max(len(model.latents) - 1, 1), size, generator=generator, device=device)
+                image = (image + 1 + others) % len(model.latents)
+            latents = functional.embedding(image, model.latents)
         loss, numbers = latent_loss(radiance_field, cache, index, target, latents, config.latent_penalty)
         share = 0.98 if step else 0.0
         recent[0] = share * recent[0] + (1 - share) * numbers["psnr"]

@@ -14,10 +14,10 @@ import torch
 
 from illuminerf.data.developing import shrunk
 from illuminerf.data.tensoir import INPUT_LIGHT, TensoirView, find_views, load_test_image
-from illuminerf.evaluation.benchmark_rule import LightScores, Rescale, ViewPair, score_light, view_pair
+from illuminerf.evaluation.benchmark_rule import LightScores, Rescale, ViewPair, on_white, score_light, view_pair
 from illuminerf.evaluation.metrics import LPIPS_ABSENT, ImageMetric, lpips_vgg
 from illuminerf.evaluation.tables import mean_of
-from illuminerf.scene.images import read_png
+from illuminerf.scene.images import read_png, write_png
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say, track
 
@@ -54,6 +54,12 @@ class PairsOnDisk:
                 fix="render at the benchmark's size, or give the benchmark at the size of the predictions",
             )
         return view_pair(prediction, truth)
+
+
+def write_predictions(novel_views: Path, names: Sequence[str], folder: Path) -> None:
+    """Bring the images of a NovelViews artefact, in the order of `names`, into <folder>/<name>.png on white."""
+    for view, name in enumerate(names):
+        write_png(folder / f"{name}.png", on_white(read_png(novel_views / "images" / f"{view:03d}.png")))
 
 
 def score_predictions(
