@@ -269,7 +269,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     ),
 }
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
-    "benchmark": {"tensoir": benchmark.tensoir_command},
+    "benchmark": {"tensoir": benchmark.tensoir_command, "report": benchmark.report_command},
     "data": {
         "preview": preview_command,
         "download-objaverse": download_objaverse_command,
