@@ -39,11 +39,10 @@ def latex_tables(methods: Sequence[MethodScores]) -> str:
 
 def _table(metric: str, methods: Sequence[MethodScores], cells: list[Cell]) -> str:
     ours = [_row(method.name, [method.value(metric, cell) for cell in cells], cells) for method in methods]
-    groups = [[_line(label, texts) for label, texts in _with_bold(ours, metric)]]
-    if metric == "psnr":
-        groups.append([_line(label, _texts(values, metric)) for label, values in _references(methods, cells)])
+    references = _references(methods, cells) if metric == "psnr" else []
     published = [(f"{escaped(row.method)}$^\\ast$", [*[None] * len(cells), getattr(row, metric)]) for row in TENSOIR]
-    groups.append([_line(label, _texts(values, metric)) for label, values in published])
+    groups = [[_line(label, texts) for label, texts in _with_bold(ours, metric)]]
+    groups += [[_line(label, _texts(values, metric)) for label, values in rows] for rows in (references, published)]
     scenes = list(dict.fromkeys(scene for scene, _ in cells))
     widths = [sum(scene == other for other, _ in cells) for scene in scenes]
     spans, rules, column = [], [], 2
@@ -51,12 +50,12 @@ def _table(metric: str, methods: Sequence[MethodScores], cells: list[Cell]) -> s
         spans.append(f"\\multicolumn{{{width}}}{{c}}{{{escaped(scene)}}}")
         rules.append(f"\\cmidrule(lr){{{column}-{column + width - 1}}}")
         column += width
+    gallery = "; $^\\dagger$~published renderings, every 20th view" if "^\\dagger" in "".join(groups[1]) else ""
     body = "\\midrule\n".join("".join(group) for group in groups if group)
     return (
         "\\begin{table}\n\\centering\\footnotesize\\setlength{\\tabcolsep}{4pt}\n"
         f"\\caption{{Relighting by the TensoIR benchmark's rule: {_CAPTIONS[metric]}. "
-        "$^\\ast$~published, over four scenes and five lights; "
-        "$^\\dagger$~published renderings, every 20th view.}\n"
+        f"$^\\ast$~published, over four scenes and five lights{gallery}.}}\n"
         f"\\begin{{tabular}}{{l{'r' * (len(cells) + 1)}}}\n\\toprule\n"
         f" & {' & '.join(spans)} & \\\\\n{''.join(rules)}\n"
         f" & {' & '.join(escaped(light) for _, light in cells)} & mean \\\\\n\\midrule\n"
@@ -66,13 +65,19 @@ def _table(metric: str, methods: Sequence[MethodScores], cells: list[Cell]) -> s
 
 def _references(methods: Sequence[MethodScores], cells: list[Cell]) -> list[_Row]:
     """What doing nothing scores, as the score files tell, and the gallery's renderings."""
-    recorded: dict[tuple[str, ...], tuple[list[str], list[float | None]]] = {}
+    recorded: list[tuple[list[str], list[float | None]]] = []
     for method in methods:
         values = [method.input_light.get(scene, {}).get(light) for scene, light in cells]
-        if any(value is not None for value in values):
-            recorded.setdefault(tuple(_texts(values, "psnr")), ([], values))[0].append(method.name)
+        if all(value is None for value in values):
+            continue
+        same = next((group for group in recorded if _agree(group[1], values)), None)
+        if same is None:
+            recorded.append(([method.name], values))
+        else:
+            same[0].append(method.name)
+            same[1][:] = [new if old is None else old for old, new in zip(same[1], values, strict=True)]
     rows = []
-    for names, values in recorded.values():
+    for names, values in recorded:
         rows.append(_row("input light" + (f" ({', '.join(names)})" if len(recorded) > 1 else ""), values, cells))
     known = [gallery_scores(*cell) for cell in cells]
     if any(known):
@@ -80,6 +85,11 @@ def _references(methods: Sequence[MethodScores], cells: list[Cell]) -> list[_Row
             values = [getattr(row, field) if row else None for row in known]
             rows.append((f"{label}$^\\dagger$", _row("", values, cells)[1]))
     return rows
+
+
+def _agree(some: Sequence[float | None], others: Sequence[float | None]) -> bool:
+    pairs = zip(_texts(some, "psnr"), _texts(others, "psnr"), strict=True)
+    return all(one == other or "--" in (one, other) for one, other in pairs)
 
 
 def _row(name: str, values: list[float | None], cells: list[Cell]) -> _Row:
