@@ -276,7 +276,8 @@ def _scale_bar() -> str:
     ticks[-1] = f"{ticks[-1]} and more"
     return (
         "<h2>Pictures</h2><p class=note>Renderings as they are scored: rescaled per channel inside the mask, on white; "
-        "those without a score file as they are. PSNR is that of the one view. Error: |difference| of sRGB values in [0, 1], mean over channels:</p>"
+        "those without a score file as they are. "
+        "PSNR is that of the one view. Error: |difference| of sRGB values in [0, 1], mean over channels:</p>"
         f"<div class=scale><img src='{png_url(thumbnail(bar, 256))}' alt='colours of the error, black at 0, white "
         f"at {FULL_SCALE}'><div>{''.join(f'<span>{tick}</span>' for tick in ticks)}</div></div>"
     )
