@@ -108,6 +108,7 @@ def test_benchmark_asks_for_what_it_needs(tmp_path: Path, capsys: pytest.Capture
         ["--help"],
         ["benchmark", "tensoir", "--help"],
         ["benchmark", "ablation", "--help"],
+        ["benchmark", "report", "--help"],
         ["models", "download", "--help"],
         *([command, "--help"] for command in COMMANDS),
     ],

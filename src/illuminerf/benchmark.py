@@ -1,6 +1,6 @@
 """Published benchmarks, reproduced by one command each."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,13 +13,18 @@ from illuminerf.diffusion.pretrained import pretrained_model
 from illuminerf.diffusion.relighting_scores import evaluate, held_out_pairs
 from illuminerf.diffusion.sampling import Sampler
 from illuminerf.diffusion.training_items import load_items
+from illuminerf.evaluation.latex_tables import latex_tables
+from illuminerf.evaluation.pictures import CellPictures
+from illuminerf.evaluation.score_files import FILE_NAME, MethodScores, all_cells, read_score_files
+from illuminerf.evaluation.score_report import score_page
 from illuminerf.evaluation.tables import cell_table, published_table
 from illuminerf.presets import DILIGHTNET, EMBEDDED, Preset, customised
+from illuminerf.stages.compare_renderings import RenderedMethod, compare_renderings
 from illuminerf.stages.score_predictions import score_input_light, score_predictions, write_predictions
-from illuminerf.workflow.atomic import write_json
+from illuminerf.workflow.atomic import write_bytes, write_json
 from illuminerf.workflow.device import resolve_device
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import console
+from illuminerf.workflow.progress import console, say, track
 
 _ESTIMATES = {
     "": "sample",
@@ -83,6 +88,44 @@ def tensoir_command(
     scores["peak_memory_gb"] = {scene: pipeline.peak_memory_gb(out / scene) for scene in scenes}
     write_json(out / "scores.json", scores)
     _report(scores, f"{len(scenes)} scenes, {len(lights)} lights, every {every}", json)
+
+
+def report_command(
+    folders: tyro.conf.Positional[tuple[Path, ...]],
+    out: Path,
+    root: Path | None = None,
+    renderings: tuple[str, ...] = (),
+    views: int = 3,
+    title: str = "Relighting scores",
+) -> None:
+    """One HTML page and LaTeX tables from any score files of `benchmark tensoir`, beside published figures.
+
+    Args:
+        folders: Folders with a scores.json, or score files of other names; each is one method, called like it.
+        out: The HTML file; the LaTeX tables are written beside it, with the ending .tex.
+        root: Unpacked benchmark; with it the page shows pictures, without it only tables.
+        renderings: NAME=FOLDER with <scene>/<light>/test_000.png: where a scored method's pictures are (by default
+            in its folder's predictions/), or further pictures, shown as they are.
+        views: Test views shown per scene and light.
+        title: Of the page.
+    """
+    if out.suffix not in (".html", ".htm"):
+        raise UserError("the report is an HTML file", got=f"--out {out}", wanted="a name such as report.html")
+    if views < 1:
+        raise UserError("there is no view to show", got=f"--views {views}", wanted="1, 2, 3, ...")
+    if renderings and root is None:
+        raise UserError("pictures are shown beside the truth", got="--renderings without --root", fix="give --root")
+    methods = read_score_files(folders)
+    pictures: Iterable[CellPictures] = ()
+    if root is not None:
+        cells = all_cells(methods)
+        shown = compare_renderings(root, _rendered(methods, _named_folders(renderings)), cells, views)
+        pictures = track(shown, "pictures", len(cells))
+    write_bytes(out, score_page(methods, pictures, title))
+    write_bytes(out.with_suffix(".tex"), latex_tables(methods).encode())
+    say(
+        f"{out} and {out.with_suffix('.tex').name}: {len(methods)} methods, {len(all_cells(methods))} scenes and lights"
+    )
 
 
 def relighting_model_command(
@@ -157,6 +200,32 @@ def relight_scene(
     for light in lights:
         rendered = out / scene.name / "lights" / light / "test_views"
         write_predictions(rendered, names, out / "predictions" / scene.name / light)
+
+
+def _named_folders(renderings: Sequence[str]) -> dict[str, Path]:
+    folders: dict[str, Path] = {}
+    for argument in renderings:
+        name, _, folder = argument.partition("=")
+        if not name or not folder or name in folders or not Path(folder).is_dir():
+            raise UserError(
+                "renderings cannot be found by this",
+                got=f"--renderings {argument}",
+                wanted="NAME=FOLDER, each name once, each folder there",
+                fix="check the name and the path",
+            )
+        folders[name] = Path(folder)
+    return folders
+
+
+def _rendered(methods: Sequence[MethodScores], folders: dict[str, Path]) -> list[RenderedMethod]:
+    """The scored methods, rescaled as their scores say, then the further ones of `folders`, as they are."""
+    scored = []
+    for method in methods:
+        usual = method.path.parent / "predictions" if method.path.name == FILE_NAME else None
+        folder = folders.get(method.name, usual)
+        scored.append(RenderedMethod(method.name, folder, method.rescale, method.scale))
+    names = {method.name for method in methods}
+    return scored + [RenderedMethod(name, folder) for name, folder in folders.items() if name not in names]
 
 
 def _light(folder: Path, name: str) -> Path:

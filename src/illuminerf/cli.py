@@ -269,7 +269,11 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     ),
 }
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
-    "benchmark": {"tensoir": benchmark.tensoir_command, "ablation": ablation.ablation_command},
+    "benchmark": {
+        "tensoir": benchmark.tensoir_command,
+        "ablation": ablation.ablation_command,
+        "report": benchmark.report_command,
+    },
     "data": {
         "preview": preview_command,
         "download-objaverse": download_objaverse_command,

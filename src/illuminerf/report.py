@@ -2,32 +2,20 @@
 
 import base64
 import html
-import io
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from illuminerf.evaluation.benchmark_rule import on_white
 from illuminerf.scene.environment import EnvironmentMap, chrome_ball
-from illuminerf.scene.images import composite, read_exr, read_png, srgb_from_linear, to_uint8
+from illuminerf.scene.images import composite, read_exr, read_png, srgb_from_linear
+from illuminerf.scene.web_page import evenly_spread, picture_row, web_page
 from illuminerf.workflow.artefact import read_metrics
 from illuminerf.workflow.atomic import read_json, write_bytes
 
 _MAX_PICTURES = 6
 _CUE_TITLES = {"diffuse": "diffuse", "ggx_005": "GGX 0.05", "ggx_013": "GGX 0.13", "ggx_034": "GGX 0.34"}
-_STYLE = """
-:root { color-scheme: light dark; --line: #8884; }
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }
-h1 { margin-bottom: 0 } h2 { margin-top: 2.2rem; border-bottom: 1px solid var(--line) } p.note { opacity: .75 }
-.row { display: flex; flex-wrap: wrap; gap: .6rem; align-items: flex-end } figure { margin: 0 }
-figcaption { font-size: .8rem; opacity: .75; text-align: center } img, video { border-radius: 6px; max-width: 100% }
-img { image-rendering: auto; height: 9.5rem } img.wide { height: 7rem } video { height: 18rem; background: #fff }
-table { border-collapse: collapse } td, th { padding: .25rem .9rem .25rem 0; text-align: right }
-td:first-child, th:first-child { text-align: left } th { border-bottom: 1px solid var(--line) }
-"""
 
 
 def write_report(
@@ -56,30 +44,25 @@ def write_report(
     if scores:
         body.append(_scores(scores))
     body.append(_costs(stages, lights))
-    page = (
-        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
-        f"<title>{html.escape(run.resolve().name)} - Open IllumiNeRF</title><style>{_STYLE}</style>"
-        f"<body>{''.join(body)}</body></html>\n"
-    )
-    write_bytes(out, page.encode())
+    write_bytes(out, web_page(run.resolve().name, "".join(body)))
     return out
 
 
 def _inputs(capture: Path) -> str:
     files = sorted((capture / "images").glob("*.png"))
-    pictures = [(on_white(read_png(path)), path.stem) for path in _spread(files)]
-    return f"<h2>Input: {len(files)} photographs</h2>{_row(pictures)}"
+    pictures = [(on_white(read_png(path)), path.stem) for path in evenly_spread(files, _MAX_PICTURES)]
+    return f"<h2>Input: {len(files)} photographs</h2>{picture_row(pictures)}"
 
 
 def _geometry(geometry: Path) -> str:
     normals = sorted((geometry / "normals").glob("*.png"))
-    pictures = [(on_white(read_png(path)), f"normals {path.stem}") for path in _spread(normals)]
-    return f"<h2>Geometry</h2>{_row(pictures)}"
+    pictures = [(on_white(read_png(path)), f"normals {path.stem}") for path in evenly_spread(normals, _MAX_PICTURES)]
+    return f"<h2>Geometry</h2>{picture_row(pictures)}"
 
 
 def _illumination(illumination: Path) -> str:
     caption = "estimated light; photographs, shading, albedo"
-    return f"<h2>The photographs' own light</h2>{_row([(read_png(illumination / 'preview.png'), caption)])}"
+    return f"<h2>The photographs' own light</h2>{picture_row([(read_png(illumination / 'preview.png'), caption)])}"
 
 
 def _light(name: str, artefacts: dict[str, Path], capture: Path) -> str:
@@ -90,7 +73,7 @@ def _light(name: str, artefacts: dict[str, Path], capture: Path) -> str:
     ball_srgb = composite(np.clip(srgb_from_linear(ball * exposure), 0, 1), alpha, 1.0)
     parts = [f"<h2>Light: {html.escape(name)}</h2>"]
     parts.append(
-        _row(
+        picture_row(
             [
                 (panorama, "the light, left to right: azimuth +180 to -180 degrees"),
                 (ball_srgb, "on a mirror ball"),
@@ -103,10 +86,14 @@ def _light(name: str, artefacts: dict[str, Path], capture: Path) -> str:
             f"<h3>Relit</h3><video controls loop muted autoplay src='data:video/mp4;base64,{encoded}'></video>"
         )
     frames = sorted((artefacts["turntable"] / "images").glob("*.png"))
-    parts.append(_row([(on_white(read_png(path)), f"view {path.stem}") for path in _spread(frames)]))
+    parts.append(
+        picture_row([(on_white(read_png(path)), f"view {path.stem}") for path in evenly_spread(frames, _MAX_PICTURES)])
+    )
     cue_files = sorted((artefacts["cues"] / "cues").glob("*.exr"))
     if cue_files:
-        parts.append(f"<h3>Radiance cues of photograph {cue_files[0].stem}</h3>{_row(_cue_pictures(cue_files[0]))}")
+        parts.append(
+            f"<h3>Radiance cues of photograph {cue_files[0].stem}</h3>{picture_row(_cue_pictures(cue_files[0]))}"
+        )
     parts.append(_samples(artefacts["relit"], capture))
     return "".join(parts)
 
@@ -131,7 +118,7 @@ def _samples(relit: Path, capture: Path) -> str:
         row = [(on_white(photograph), f"photograph {view}")]
         for path in [file for file in files if file.stem.startswith(f"{view}_")][: _MAX_PICTURES - 1]:
             row.append((read_png(path)[..., :3] + (1 - alpha[..., None]), f"sample {path.stem.rsplit('_', 1)[1]}"))
-        parts.append(_row(row))
+        parts.append(picture_row(row))
     return "".join(parts)
 
 
@@ -165,25 +152,3 @@ def _exposure(linear_rgb: np.ndarray) -> float:
     """A factor for looking at radiance: the mean of what is lit becomes a mid grey."""
     lit = linear_rgb[linear_rgb.max(-1) > 1e-4]
     return float(np.clip(0.35 / max(float(np.minimum(lit, 4).mean()), 1e-6), 0.05, 8)) if lit.size else 1.0
-
-
-def _spread(files: Sequence[Path]) -> list[Path]:
-    count = min(len(files), _MAX_PICTURES)
-    return [files[int(i)] for i in np.linspace(0, len(files) - 1, count)] if files else []
-
-
-def _row(pictures: list[tuple[np.ndarray, str]]) -> str:
-    figures = "".join(
-        f"<figure><img {'class=wide' if image.shape[1] > 1.6 * image.shape[0] else ''} src='{_data_url(image)}' "
-        f"alt='{html.escape(title)}'><figcaption>{html.escape(title)}</figcaption></figure>"
-        for image, title in pictures
-    )
-    return f"<div class=row>{figures}</div>"
-
-
-def _data_url(image: np.ndarray) -> str:
-    buffer = io.BytesIO()
-    picture = Image.fromarray(to_uint8(image))
-    picture.thumbnail((640, 640))
-    picture.save(buffer, "PNG", optimize=True)
-    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"

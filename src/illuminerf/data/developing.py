@@ -136,6 +136,11 @@ def shrunk(straight: np.ndarray, longest_side: int) -> np.ndarray:
     return straight_srgb_uint8(small).astype(np.float32) / 255
 
 
+def with_alpha(image: np.ndarray) -> np.ndarray:
+    """[height, width, 4]: `image` [.., .., 3 or 4], opaque where it has no alpha."""
+    return image if image.shape[-1] == 4 else np.dstack([image, np.ones_like(image[..., 0])])
+
+
 def straight_srgb_uint8(rgba: np.ndarray) -> np.ndarray:
     """uint8 [height, width, 4], straight sRGB and alpha, from linear premultiplied float; black where alpha
     is 0.

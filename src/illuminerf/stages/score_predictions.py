@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from illuminerf.data.developing import shrunk
+from illuminerf.data.developing import shrunk, with_alpha
 from illuminerf.data.tensoir import INPUT_LIGHT, TensoirView, find_views, load_test_image
 from illuminerf.evaluation.benchmark_rule import LightScores, Rescale, ViewPair, on_white, score_light, view_pair
 from illuminerf.evaluation.metrics import LPIPS_ABSENT, ImageMetric, lpips_vgg
@@ -45,7 +45,7 @@ class PairsOnDisk:
         truth = load_test_image(self.scene, self.names[index], self.light)
         if self.size is not None:
             truth = shrunk(truth, self.size)
-            prediction = shrunk(_with_alpha(prediction), self.size)
+            prediction = shrunk(with_alpha(prediction), self.size)
         if prediction.shape[:2] != truth.shape[:2]:
             raise UserError(
                 "a prediction has another size than the truth",
@@ -164,10 +164,6 @@ def _scored(
         say(LPIPS_ABSENT)
     scores = [_score(pairs, rescale, lpips) for pairs in track(plans, "score")]
     return _as_json(cells, scores, rescale)
-
-
-def _with_alpha(image: np.ndarray) -> np.ndarray:
-    return image if image.shape[-1] == 4 else np.dstack([image, np.ones_like(image[..., 0])])
 
 
 def _score(pairs: PairsOnDisk, rescale: Rescale, lpips: ImageMetric | None) -> LightScores:
