@@ -121,7 +121,8 @@ def _preview(light: EnvironmentMap, views: Views, out: Path) -> np.ndarray:
         shading = np.stack([channels[name] for name in "RGB"], -1) / np.maximum(alpha, 1e-3)
         photograph, mask = views.srgb[view], views.alpha[view][..., None]
         albedo = srgb_from_linear(linear_from_srgb(photograph) / np.maximum(shading, 1e-2))
-        shown = [photograph * mask, srgb_from_linear(shading) * alpha, albedo * mask * alpha]
+        bright = np.quantile(shading[alpha[..., 0] > 0.5], 0.95) if (alpha > 0.5).any() else 1.0
+        shown = [photograph * mask, srgb_from_linear(shading / max(bright, 1e-3)) * alpha, albedo * mask * alpha]
         rows.append(np.concatenate([np.clip(image, 0, 1) for image in shown], 1))
     width = rows[0].shape[1]
     wide = np.zeros((width // 2, 2 * (width // 2), 3), np.float32)
