@@ -165,8 +165,7 @@ def _estimated_shading(
     if _uniform(generator) < 0.7:
         tint = torch.exp(config.tint * torch.randn(3, generator=generator))
         mixture[wrong_light] += 0.6 * error * _uniform(generator) * mixture.sum(0).mean() * tint
-    shading = sum(item.cues[light, :3].float() * mixture[light][:, None, None] for light in range(len(mixture)))
-    assert isinstance(shading, Tensor)
+    shading = _mixed(item.cues[:, :3], mixture)
     mean = ((shading * alpha).sum((1, 2), keepdim=True) / alpha.sum().clamp_min(1e-3)).clamp_min(1e-4)
     power = 1 + error * (0.45 * _uniform(generator) - 0.3)
     gains = 0.2 * torch.randn((), generator=generator) + 0.15 * torch.randn(3, generator=generator)
