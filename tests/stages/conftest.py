@@ -18,7 +18,7 @@ from illuminerf.stages import estimate_geometry
 
 RADIUS = 0.6
 _GRID = HashGridConfig(5, 2, 12, 8, 48)
-_GEOMETRY = estimate_geometry.Config(
+TINY_GEOMETRY = estimate_geometry.Config(
     radiance_field=FieldConfig(
         SurfaceConfig(_GRID, 32, HashGridConfig(4, 2, 11, 8, 32), 16, initial_beta=0.01),
         AppearanceConfig(_GRID, 8, 32, 1, 2, 4, 16),
@@ -67,4 +67,4 @@ def sphere_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def sphere_geometry(sphere_capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short fit to it."""
-    return estimate_geometry.run(sphere_capture, _GEOMETRY, tmp_path_factory.mktemp("fit") / "geometry")
+    return estimate_geometry.run(sphere_capture, TINY_GEOMETRY, tmp_path_factory.mktemp("fit") / "geometry")

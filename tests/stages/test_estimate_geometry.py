@@ -9,37 +9,24 @@ import torch
 
 from illuminerf.data.capture import load_capture
 from illuminerf.fields import optimisation
-from illuminerf.fields.appearance import AppearanceConfig
 from illuminerf.fields.geometry_fit import GeometryLossConfig
-from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.image_rendering import observed_cells
 from illuminerf.fields.optimisation import OptimiserConfig
-from illuminerf.fields.proposal_sampling import ProposalConfig
-from illuminerf.fields.radiance_field import FieldConfig
 from illuminerf.fields.storage import load_field
-from illuminerf.fields.surface import SurfaceConfig
 from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.stages import estimate_geometry
 from illuminerf.workflow.artefact import read_metrics
 from illuminerf.workflow.config import from_json, to_json
 from illuminerf.workflow.errors import UserError
+from tests.stages.conftest import TINY_GEOMETRY
 
-_GRID = HashGridConfig(5, 2, 12, 8, 48)
-CONFIG = estimate_geometry.Config(
-    radiance_field=FieldConfig(
-        SurfaceConfig(_GRID, 32, HashGridConfig(4, 2, 11, 8, 32), 16, initial_beta=0.01),
-        AppearanceConfig(_GRID, 8, 32, 1, 2, 4, 16),
-        ProposalConfig(HashGridConfig(3, 2, 10, 8, 24), 8),
-        num_proposal_samples=16,
-        num_samples=10,
-    ),
+CONFIG = replace(
+    TINY_GEOMETRY,
     optimiser=OptimiserConfig(num_steps=200, rays_per_step=128, warmup_steps=10, checkpoint_every=60),
     losses=GeometryLossConfig(first_levels=2),
-    occupancy_side=32,
     mesh_resolution=48,
     num_held_out_views=1,
     num_previews=1,
-    device="cpu",
 )
 
 

@@ -202,10 +202,11 @@ class TextureNetwork(nn.Module):
         # A material needs two maps per channel: an offset and a gain on the image.
         num_maps = NUM_CUE_CHANNELS * (2 if config.is_material else 1)
         self.refines = nn.ModuleList(ResidualBlock(width) for width in widths[-2::-1] if config.is_material)
-        self.out = nn.Conv2d(widths[0], num_maps * patch**2, 3 if patch == 1 else 1, 1, int(patch == 1))
+        last = (widths[0], num_maps * patch**2, 3 if patch == 1 else 1, 1, int(patch == 1))
+        self.out = nn.Conv2d(*last)
         if config.is_material:
             # What is certain with the shading is a guess without it: each case has a last layer of its own.
-            self.lit_out = nn.Conv2d(widths[0], num_maps * patch**2, 3 if patch == 1 else 1, 1, int(patch == 1))
+            self.lit_out = nn.Conv2d(*last)
             _start_as_unlit_image(self.out, patch)
             _start_as_unlit_image(self.lit_out, patch)
 
