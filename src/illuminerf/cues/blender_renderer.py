@@ -20,12 +20,13 @@ import numpy as np
 
 from illuminerf.cues.blender_job import Rendering, read_rendering, write_job
 from illuminerf.cues.item_renderer import RenderedItem, surface_of
-from illuminerf.cues.materials import Parts
+from illuminerf.cues.materials import Material, Parts
 from illuminerf.cues.renderer import CUE_NAMES, CUE_ROUGHNESS, CueSampling
 from illuminerf.cues.shading import PATH_DEPTH, ShadedScene
 from illuminerf.cues.texture_baking import baked
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.environment import EnvironmentMap
+from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.workflow.device import derived_seed
 from illuminerf.workflow.errors import UserError
 
@@ -82,7 +83,14 @@ class BlenderItemRenderer:
         if not self.timeout_seconds > 0:
             raise UserError("timeout_seconds is too small", got=str(self.timeout_seconds), wanted="more than 0")
 
-    def render(self, parts: Parts, camera: Cameras, lights: list[EnvironmentMap], seed: int) -> RenderedItem:
+    def render(
+        self,
+        parts: Parts,
+        camera: Cameras,
+        lights: list[EnvironmentMap],
+        seed: int,
+        cue_mesh: TriangleMesh | None = None,
+    ) -> RenderedItem:
         """Render what the first view of `camera` sees of `parts`, once per light.
 
         Raises:
@@ -90,22 +98,34 @@ class BlenderItemRenderer:
             UserError: there is no Blender, or this machine is short of something that it needs.
         """
         renderings = self._renderings(len(lights), seed)
-        device = self.cue_sampling.device
+        if cue_mesh is None:
+            images = self._pictures(parts, camera, lights, renderings)
+        else:
+            own = [rendering for rendering in renderings if rendering.material == "own"]
+            others = [rendering for rendering in renderings if rendering.material != "own"]
+            images = self._pictures(parts, camera, lights, own)
+            images |= self._pictures([(cue_mesh, Material())], camera, lights, others)
+        planes = {key: image.transpose(2, 0, 1) for key, image in images.items()}
+        targets = [planes[f"target_{i}"][:3] for i in range(len(lights))]
+        cues = [np.concatenate([planes[f"{cue}_{i}"][:3] for cue in CUE_NAMES]) for i in range(len(lights))]
+        properties = baked(parts) if self.bakes_properties else parts
+        scene = ShadedScene(properties, lights[0], self.cue_sampling.device)
+        alpha = np.clip(images["target_0"][..., 3], 0, 1)
+        return RenderedItem(np.stack(targets), np.stack(cues), alpha, *surface_of(scene, camera))
+
+    def _pictures(
+        self, parts: Parts, camera: Cameras, lights: list[EnvironmentMap], renderings: list[Rendering]
+    ) -> dict[str, np.ndarray]:
+        """What one Blender process renders, by name: [height, width, 4]."""
         with tempfile.TemporaryDirectory(prefix="illuminerf-blender-") as name:
             folder = Path(name)
             try:
-                write_job(folder, parts, camera, lights, renderings, self.denoises, device)
+                write_job(folder, parts, camera, lights, renderings, self.denoises, self.cue_sampling.device)
             except OSError as error:
                 raise UserError("Blender's job cannot be written", got=str(error), fix=_FREE_SPACE) from error
             timeout = capped_timeout(self.timeout_seconds)
             run_blender(worker_command(self.executable, folder), folder / "log.txt", timeout)
-            images = {r.name: _picture(folder, r.name, camera) for r in renderings}
-        planes = {key: image.transpose(2, 0, 1) for key, image in images.items()}
-        targets = [planes[f"target_{i}"][:3] for i in range(len(lights))]
-        cues = [np.concatenate([planes[f"{cue}_{i}"][:3] for cue in CUE_NAMES]) for i in range(len(lights))]
-        scene = ShadedScene(baked(parts) if self.bakes_properties else parts, lights[0], device)
-        alpha = np.clip(images["target_0"][..., 3], 0, 1)
-        return RenderedItem(np.stack(targets), np.stack(cues), alpha, *surface_of(scene, camera))
+            return {r.name: _picture(folder, r.name, camera) for r in renderings}
 
     def _renderings(self, num_lights: int, seed: int) -> list[Rendering]:
         cues, result = self.cue_sampling, []

@@ -15,6 +15,7 @@ from illuminerf.cues.shading import ShadedScene, concatenated
 from illuminerf.cues.texture_baking import baked
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.environment import EnvironmentMap
+from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.workflow.device import derived_seed
 
 
@@ -44,7 +45,14 @@ class RenderedItem:
 class ItemRenderer(Protocol):
     """A path tracer for training items. The same arguments give the same arrays."""
 
-    def render(self, parts: Parts, camera: Cameras, lights: list[EnvironmentMap], seed: int) -> RenderedItem:
+    def render(
+        self,
+        parts: Parts,
+        camera: Cameras,
+        lights: list[EnvironmentMap],
+        seed: int,
+        cue_mesh: TriangleMesh | None = None,
+    ) -> RenderedItem:
         """Render what the first view of `camera` sees of `parts`, once per light.
 
         Args:
@@ -52,6 +60,7 @@ class ItemRenderer(Protocol):
             camera: one view.
             lights: equirectangular maps of one resolution, in our axes.
             seed: every random stream is derived from it.
+            cue_mesh: what the cues are rendered from; None: the meshes of `parts`.
         """
         ...
 
@@ -67,10 +76,18 @@ class MitsubaItemRenderer:
     bakes_textures: bool = True
     """Move textures onto vertices first."""
 
-    def render(self, parts: Parts, camera: Cameras, lights: list[EnvironmentMap], seed: int) -> RenderedItem:
+    def render(
+        self,
+        parts: Parts,
+        camera: Cameras,
+        lights: list[EnvironmentMap],
+        seed: int,
+        cue_mesh: TriangleMesh | None = None,
+    ) -> RenderedItem:
         """Render what the first view of `camera` sees of `parts`, once per light."""
         scene = ShadedScene(baked(parts) if self.bakes_textures else parts, lights[0], self.cue_sampling.device)
-        tracer = MitsubaCueRenderer(concatenated([mesh for mesh, _ in parts]), lights[0], self.cue_sampling)
+        cue_mesh = concatenated([mesh for mesh, _ in parts]) if cue_mesh is None else cue_mesh
+        tracer = MitsubaCueRenderer(cue_mesh, lights[0], self.cue_sampling)
         targets, cues = [], []
         alpha = np.zeros(0, np.float32)
         for index, light in enumerate(lights):

@@ -15,11 +15,13 @@ import numpy as np
 
 from illuminerf.cues.blender_renderer import BlenderFailed, BlenderItemRenderer, worker_command
 from illuminerf.cues.broken_object import BrokenObject
+from illuminerf.cues.dents import DentVariation, dented, drawn_tilts
 from illuminerf.cues.item_renderer import ItemRenderer, MitsubaItemRenderer
 from illuminerf.cues.materials import Parts
 from illuminerf.cues.mitsuba_variant import choose_variant, load_mitsuba
 from illuminerf.cues.object_files import ObjectReading, load_object
 from illuminerf.cues.renderer import CueSampling
+from illuminerf.cues.shading import concatenated
 from illuminerf.cues.training_cameras import CameraSphere, draw_camera
 from illuminerf.cues.training_lights import LightVariation, draw_light
 from illuminerf.cues.variations import MaterialVariation, varied
@@ -53,6 +55,8 @@ class ViewSettings:
     """How maps become lights."""
     materials: MaterialVariation = field(default_factory=MaterialVariation)
     """How objects are varied."""
+    dents: DentVariation = field(default_factory=DentVariation)
+    """How wrong the geometry of the cues is."""
     light_height: int = 256
     """Rows that all maps are brought to."""
     reading: ObjectReading = field(default_factory=ObjectReading)
@@ -83,6 +87,7 @@ class ViewSettings:
             cue_sampling=CueSampling(samples_per_pixel=512),
             cameras=CameraSphere.paper(),
             materials=MaterialVariation.none(),
+            dents=DentVariation(0.0),
             light_height=512,
             bakes_textures=False,
         )
@@ -194,7 +199,13 @@ def _rendered(
     chosen = of_lights.choice(len(lights), settings.num_lights, replace=False)
     draws = [draw_light(lights[int(i)], of_lights, settings.lights) for i in chosen]
     seed = derived_seed(settings.seed, "render", key)
-    rendered = settings.item_renderer().render(varied_parts, camera, [light for light, _ in draws], seed)
+    of_dents = numpy_generator(settings.seed, "dents", key)
+    tilts = drawn_tilts(settings.dents, of_dents)
+    cue_mesh = None
+    if tilts:
+        whole = concatenated([mesh for mesh, _ in varied_parts])
+        cue_mesh = dented(whole, settings.dents.sizes, tilts, of_dents)
+    rendered = settings.item_renderer().render(varied_parts, camera, [light for light, _ in draws], seed, cue_mesh)
     if not (np.isfinite(rendered.targets).all() and np.isfinite(rendered.cues).all()):
         return LeftOut("not finite", "the rendering holds NaN or infinite radiance")
     if not (rendered.alpha > 0.5).any():
@@ -205,6 +216,7 @@ def _rendered(
         "view": view,
         "split": settings.split,
         "variations": variations,
+        "dent_tilts_degrees": tilts,
         "licences": {other.id: other.licence for other in used if other.licence},
         "lights": [to_json(draw) for _, draw in draws],
         "camera": camera.to_dict(),

@@ -36,7 +36,7 @@ def baked(parts: Parts, max_edge: float = 0.03, max_faces: int = 40_000) -> Part
     textured = [mesh.vertices[mesh.faces] for mesh, material in parts if material.is_textured]
     if not textured:
         return parts
-    max_edge = _affordable_edge(np.concatenate(textured), max_edge, max_faces)
+    max_edge = affordable_edge(np.concatenate(textured), max_edge, max_faces)
     return [
         _baked_part(mesh, material, max_edge) if material.is_textured else (mesh, material) for mesh, material in parts
     ]
@@ -45,11 +45,11 @@ def baked(parts: Parts, max_edge: float = 0.03, max_faces: int = 40_000) -> Part
 def baked_with_tint(mesh: TriangleMesh, material: Material, tint: np.ndarray) -> tuple[TriangleMesh, Material]:
     """A textured part whose base colour is also multiplied by `tint` [V, 3] per vertex, as a finer mesh in the unit
     sphere with per-vertex values."""
-    max_edge = _affordable_edge(mesh.vertices[mesh.faces], _TINT_EDGE, _TINT_FACES)
+    max_edge = affordable_edge(mesh.vertices[mesh.faces], _TINT_EDGE, _TINT_FACES)
     return _baked_part(mesh, material, max_edge, tint)
 
 
-def _affordable_edge(corners: np.ndarray, max_edge: float, max_faces: int) -> float:
+def affordable_edge(corners: np.ndarray, max_edge: float, max_faces: int) -> float:
     """`max_edge`, enlarged until about `max_faces` come out or no face is split."""
     while _predicted_faces(corners, max_edge) > max(max_faces, 1.2 * len(corners)):
         max_edge *= _COARSER

@@ -46,7 +46,8 @@ class AugmentationConfig:
     """How examples are varied."""
 
     composited_share: float = 0.3
-    """Share of examples whose material is random and composited from the cues."""
+    """Share of examples whose material is random and composited from the cues; never where these are dented, since
+    the pictures would have the dents too."""
     mixture_share: float = 0.5
     """Share of input and of target lights that are mixtures of two rendered lights rather than one."""
     tint: float = 0.2
@@ -126,7 +127,7 @@ def _example(
     order = torch.randperm(len(item.targets), generator=generator).tolist()
     channels = torch.randperm(3, generator=generator)
     mixtures = [_mixture(order, config, generator), _mixture(order[::-1], config, generator)]
-    is_composited = _uniform(generator) < config.composited_share
+    is_composited = _uniform(generator) < config.composited_share and not item.is_dented
     surface = _random_surface(item, albedo_item, generator) if is_composited else surface_of(item)
     images, cue_stacks, gains = [], [], []
     for weights in mixtures:

@@ -3,7 +3,7 @@
 They are read from the shards that `render_training_pairs` writes (see `scene.relighting_pairs`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,8 @@ class TrainingItem:
     albedo: Float[Tensor, "3 height width"]
     roughness: Float[Tensor, "1 height width"]
     metallic: Float[Tensor, "1 height width"]
+    is_dented: bool = False
+    """Whether the cues come from geometry that is not quite the targets'."""
 
 
 def load_items(folder: str | Path, size: int) -> list[TrainingItem]:
@@ -41,7 +43,10 @@ def load_items(folder: str | Path, size: int) -> list[TrainingItem]:
     Raises:
         UserError: there is no item, or one is damaged or larger than `size` by no whole factor.
     """
-    items = [training_item(key, arrays, size) for key, arrays, _ in iterate_items(folder)]
+    items = [
+        replace(training_item(key, arrays, size), is_dented=bool(metadata.get("dent_tilts_degrees")))
+        for key, arrays, metadata in iterate_items(folder)
+    ]
     if not items:
         raise UserError(f"{folder} holds no training items", wanted="pairs-000000.tar, ...", fix="render pairs first")
     return sorted((item for item in items if _is_usable(item)), key=lambda item: item.name)

@@ -9,7 +9,7 @@ A sample of a shard is `<key>.safetensors` with
     roughness, metallic  uint8 [covered]      times 255, straight
     normal       float16 [3, covered]         unit, world frame, towards the camera
 and `<key>.json`: object, object_sha256, view, split, variations, lights (name, rotation_radians, is_flipped,
-permutation, scale), camera, coverage, licences.
+permutation, scale), dent_tilts_degrees (empty: exact cues), camera, coverage, licences.
 From k lights come k * (k - 1) ordered pairs: input under one light, cues and target under another.
 """
 
