@@ -39,7 +39,9 @@ def test_vertices_in_one_place_stay_in_one_place() -> None:
     box = trimesh.creation.box((1, 1, 1))
     box.unmerge_vertices()
     mesh = TriangleMesh(
-        np.asarray(box.vertices, np.float32), np.asarray(box.faces, np.int32), np.asarray(box.vertex_normals, np.float32)
+        np.asarray(box.vertices, np.float32),
+        np.asarray(box.faces, np.int32),
+        np.asarray(box.vertex_normals, np.float32),
     )
     result = dented(mesh, SIZES, (8.0, 8.0), np.random.default_rng(2))
     merged = trimesh.Trimesh(result.vertices, result.faces, process=False)
