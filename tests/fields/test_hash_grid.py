@@ -49,7 +49,7 @@ def test_features_alone_send_the_same_gradient_to_the_table() -> None:
 def test_gradcheck_of_the_kernel() -> None:
     grid, positions = _double_grid(), _positions(6)
     table = grid.table.detach().clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda t: KernelInterpolation.apply(t, positions, grid._layout, True), (table,))
+    assert torch.autograd.gradcheck(lambda t: KernelInterpolation.apply(t, positions, grid.layout, True), (table,))
 
 
 def test_jacobian_is_the_derivative_of_the_features() -> None:

@@ -66,7 +66,7 @@ class HashGrid(nn.Module):
         limit = 2**config.log2_entries
         self._sizes = [min((r + 1) ** 3, limit) for r in self._resolutions]
         self._offsets = [sum(self._sizes[:level]) for level in range(config.num_levels)]
-        self._layout = kernel_layout(self._resolutions, self._sizes, self._offsets)
+        self.layout = kernel_layout(self._resolutions, self._sizes, self._offsets)
         table = torch.rand(sum(self._sizes), config.num_features, generator=generator)
         self.table = nn.Parameter((table * 2 - 1) * 1e-4)
 
@@ -77,7 +77,7 @@ class HashGrid(nn.Module):
         if positions.is_cuda or not len(positions):
             features, _ = interpolate(positions, self.table, self._resolutions, self._sizes, self._offsets)
         else:
-            features, _ = KernelInterpolation.apply(self.table, positions, self._layout, False)
+            features, _ = KernelInterpolation.apply(self.table, positions, self.layout, False)
         return features if level_weights is None else features * self._columns(level_weights)
 
     def with_jacobian(
@@ -89,7 +89,7 @@ class HashGrid(nn.Module):
                 positions, self.table, self._resolutions, self._sizes, self._offsets, with_jacobian=True
             )
         else:
-            features, jacobian = KernelInterpolation.apply(self.table, positions, self._layout, True)
+            features, jacobian = KernelInterpolation.apply(self.table, positions, self.layout, True)
         if level_weights is None:
             return features, jacobian
         columns = self._columns(level_weights)

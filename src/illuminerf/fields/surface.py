@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from illuminerf.fields.bounds import OccupiedCells
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
+from illuminerf.fields.surface_kernel import FusedSurface
 from illuminerf.fields.volume_rendering import optical_depth
 from illuminerf.workflow.errors import UserError
 
@@ -71,18 +72,30 @@ class SurfaceField(nn.Module):
     def forward(
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> SurfacePoint:
-        """Signed distance and its gradient.
+        """Signed distance and its gradient."""
+        if positions.is_cuda or positions.dtype != torch.float32 or not len(positions):
+            distance, gradient = self.residual(positions, level_weights)
+        else:
+            levels = torch.ones(self.config.grid.num_levels) if level_weights is None else level_weights
+            layers = (self.hidden.weight, self.hidden.bias, self.head.weight)
+            distance, gradient = FusedSurface.apply(self.grid.table, *layers, positions, self.grid.layout, levels)
+        distance = distance + self.head.bias - self.config.initial_radius
+        radius = positions.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        return SurfacePoint(distance + radius[..., 0], gradient + positions / radius)
+
+    def residual(
+        self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
+    ) -> SurfacePoint:
+        """What is added to the initial sphere, less the last layer's bias: the readable twin of `FusedSurface`.
 
         The gradient of the small MLP is written out (softplus' is the sigmoid) and chained with the Jacobian of the
         hash grid; both are ordinary differentiable functions of the parameters.
         """
         features, jacobian = self.grid.with_jacobian(positions, level_weights)
         hidden, slope = _SoftplusWithSlope.apply(self.hidden(features))
-        distance = self.head(hidden)[..., 0]
         by_feature = (slope * self.head.weight) @ self.hidden.weight
         gradient = torch.einsum("nf,nfi->ni", by_feature, jacobian)
-        radius = positions.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-        return SurfacePoint(distance + radius[..., 0] - self.config.initial_radius, gradient + positions / radius)
+        return SurfacePoint((hidden @ self.head.weight.T)[..., 0], gradient)
 
     def signed_distance(
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
