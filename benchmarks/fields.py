@@ -2,8 +2,8 @@
 
     python benchmarks/fields.py [--device cpu] [--preset embedded] [--seconds 10]
 
-Rays per second of whole training steps (forward, backward, Adam) of both fits on a synthetic sphere, and the ratio of
-the hash grid's kernel to its readable twin on 2^17 points and 16 levels, with the Jacobian, forward and backward.
+Rays per second of whole training steps (forward, backward, Adam) of both fits on a synthetic sphere, and how much
+faster the CPU kernels are than their readable twins on 2^17 points and 16 levels.
 """
 
 import argparse
@@ -18,10 +18,11 @@ import torch
 
 from illuminerf.fields.bounds import OccupiedCells, ball_interval
 from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss
-from illuminerf.fields.hash_grid import HashGrid, HashGridConfig, interpolate
+from illuminerf.fields.hash_grid import HashGridConfig, interpolate
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
 from illuminerf.fields.ray_pool import RayPool, gather_rays
 from illuminerf.fields.shading_cache import cache_shading, latent_loss
+from illuminerf.fields.surface import SurfaceConfig, SurfaceField
 from illuminerf.scene.cameras import sphere_cameras
 from illuminerf.workflow.device import resolve_device, torch_generator
 
@@ -101,22 +102,36 @@ def fits(config: FieldConfig, num_rays: int, seconds: float, device: torch.devic
     return result | {"latent_rays_per_second": batch / spent, "latent_step_ms": 1e3 * spent}
 
 
-def kernel_against_twin(seconds: float, device: torch.device, num_points: int = 1 << 17) -> dict[str, float]:
-    """Forward and backward of features and Jacobian at 16 levels: what the fields use on `device`, and its twin."""
-    grid = HashGrid(HashGridConfig(16, 2, 17, 16, 2048)).to(device)
-    positions = (torch.rand(num_points, 3, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9).to(device)
+def kernels_against_twins(seconds: float, num_points: int = 1 << 17) -> dict[str, float]:
+    """Times in ms and ratios on a CPU at 16 levels, forward and backward: the hash grid alone with its whole Jacobian,
+    and the surface under an eikonal loss, whose gradient is of second order.
 
-    def kernel(_: int) -> None:
-        features, jacobian = grid.with_jacobian(positions)
+    The twins are `interpolate` and `SurfaceField.residual` in plain torch.
+    """
+    grid_config = HashGridConfig(16, 2, 17, 16, 2048)
+    surface = SurfaceField(SurfaceConfig(grid=grid_config))
+    grid = surface.grid
+    positions = torch.rand(num_points, 3, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9
+
+    def readable() -> tuple[torch.Tensor, torch.Tensor]:
+        return interpolate(positions, grid.table, grid._resolutions, grid._sizes, grid._offsets, with_jacobian=True)
+
+    def of_grid(features: torch.Tensor, jacobian: torch.Tensor) -> None:
         (features.sum() + jacobian.sum()).backward()
 
-    def twin(_: int) -> None:
-        layout = (grid._resolutions, grid._sizes, grid._offsets)
-        features, jacobian = interpolate(positions, grid.table, *layout, with_jacobian=True)
-        (features.sum() + jacobian.sum()).backward()
+    def of_surface(distance: torch.Tensor, gradient: torch.Tensor) -> None:
+        (distance.abs().mean() + ((gradient.norm(dim=-1) - 1) ** 2).mean()).backward()
 
-    fast, slow = seconds_per_call(kernel, seconds, device), seconds_per_call(twin, seconds, device)
-    return {"kernel_ms": 1e3 * fast, "twin_ms": 1e3 * slow, "twin_over_kernel": slow / fast}
+    calls = {
+        "grid_kernel_ms": lambda _: of_grid(*grid.with_jacobian(positions)),
+        "grid_twin_ms": lambda _: of_grid(*readable()),
+        "surface_kernel_ms": lambda _: of_surface(*surface(positions)),
+        "surface_twin_ms": lambda _: of_surface(*surface.residual(*readable())),
+    }
+    result = {name: 1e3 * seconds_per_call(call, seconds, torch.device("cpu")) for name, call in calls.items()}
+    result["grid_twin_over_kernel"] = result["grid_twin_ms"] / result["grid_kernel_ms"]
+    result["surface_twin_over_kernel"] = result["surface_twin_ms"] / result["surface_kernel_ms"]
+    return result
 
 
 def main() -> None:
@@ -137,7 +152,7 @@ def main() -> None:
     }
     result |= {name: round(value, 2) for name, value in fits(config, args.rays, args.seconds, device).items()}
     if device.type == "cpu":
-        result |= {name: round(value, 2) for name, value in kernel_against_twin(args.seconds, device).items()}
+        result |= {name: round(value, 2) for name, value in kernels_against_twins(args.seconds).items()}
     print(json.dumps(result, indent=2))
 
 

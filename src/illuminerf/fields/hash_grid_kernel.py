@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 _PRIME_Y, _PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
-_NUM_PARTS = 16  # of the points, each a thread's work; a level's table stays in the cache while a part is done
+_NUM_PARTS = 4  # of the points of each level: a thread stays with one level, whose table stays in its cache
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
@@ -58,28 +58,28 @@ def _corners(position, level, half):
 @njit(parallel=True, cache=True, fastmath=FAST)
 @no_type_check
 def grid_forward(positions, table, layout, halves, features, jacobian, with_jacobian):
-    """Features [points, width] and, where asked, the Jacobian [points, width, 3], level by level."""
+    """Features [points, levels, features] and, where asked, the Jacobian [points, levels, features, 3], level by level.
+
+    In whatever order of memory: with the levels outermost each thread writes one stretch.
+    """
     num_points, num_features = positions.shape[0], table.shape[1]
-    for part in prange(_NUM_PARTS):
-        for level in range(layout.shape[0]):
-            half = halves[level]
-            for n in range(part * num_points // _NUM_PARTS, (part + 1) * num_points // _NUM_PARTS):
-                fx, fy, fz, (i000, i100, i010, i110, i001, i101, i011, i111) = _corners(
-                    positions[n], layout[level], half
-                )
-                for f in range(num_features):
-                    v000, v010, v001, v011 = table[i000, f], table[i010, f], table[i001, f], table[i011, f]
-                    d00, d10 = table[i100, f] - v000, table[i110, f] - v010
-                    d01, d11 = table[i101, f] - v001, table[i111, f] - v011
-                    c00, c10, c01, c11 = v000 + d00 * fx, v010 + d10 * fx, v001 + d01 * fx, v011 + d11 * fx
-                    c0, c1 = c00 + (c10 - c00) * fy, c01 + (c11 - c01) * fy
-                    column = level * num_features + f
-                    features[n, column] = c0 + (c1 - c0) * fz
-                    if with_jacobian:
-                        d0, d1 = d00 + (d10 - d00) * fy, d01 + (d11 - d01) * fy
-                        jacobian[n, column, 0] = (d0 + (d1 - d0) * fz) * half
-                        jacobian[n, column, 1] = ((c10 - c00) + ((c11 - c01) - (c10 - c00)) * fz) * half
-                        jacobian[n, column, 2] = (c1 - c0) * half
+    for job in prange(_NUM_PARTS * layout.shape[0]):
+        level, part = job // _NUM_PARTS, job % _NUM_PARTS
+        half = halves[level]
+        for n in range(part * num_points // _NUM_PARTS, (part + 1) * num_points // _NUM_PARTS):
+            fx, fy, fz, (i000, i100, i010, i110, i001, i101, i011, i111) = _corners(positions[n], layout[level], half)
+            for f in range(num_features):
+                v000, v010, v001, v011 = table[i000, f], table[i010, f], table[i001, f], table[i011, f]
+                d00, d10 = table[i100, f] - v000, table[i110, f] - v010
+                d01, d11 = table[i101, f] - v001, table[i111, f] - v011
+                c00, c10, c01, c11 = v000 + d00 * fx, v010 + d10 * fx, v001 + d01 * fx, v011 + d11 * fx
+                c0, c1 = c00 + (c10 - c00) * fy, c01 + (c11 - c01) * fy
+                features[n, level, f] = c0 + (c1 - c0) * fz
+                if with_jacobian:
+                    d0, d1 = d00 + (d10 - d00) * fy, d01 + (d11 - d01) * fy
+                    jacobian[n, level, f, 0] = (d0 + (d1 - d0) * fz) * half
+                    jacobian[n, level, f, 1] = ((c10 - c00) + ((c11 - c01) - (c10 - c00)) * fz) * half
+                    jacobian[n, level, f, 2] = (c1 - c0) * half
 
 
 @njit(inline="always")
@@ -117,20 +117,19 @@ def grid_backward(positions, table_grad, layout, halves, features_grad, jacobian
         for n in range(positions.shape[0]):
             fx, fy, fz, corners = _corners(positions[n], layout[level], half)
             for f in range(num_features):
-                column = level * num_features + f
-                g = features_grad[n, column]
+                g = features_grad[n, level, f]
                 gx = gy = gz = g - g
                 if with_jacobian:
-                    gx = jacobian_grad[n, column, 0] * half
-                    gy = jacobian_grad[n, column, 1] * half
-                    gz = jacobian_grad[n, column, 2] * half
+                    gx = jacobian_grad[n, level, f, 0] * half
+                    gy = jacobian_grad[n, level, f, 1] * half
+                    gz = jacobian_grad[n, level, f, 2] * half
                 _scatter(table_grad, f, corners, fx, fy, fz, g, gx, gy, gz)
 
 
 @njit(parallel=True, cache=True, fastmath=FAST)
 @no_type_check
 def grid_backward_outer(positions, table_grad, layout, halves, features_grad, by_feature, directions):
-    """`grid_backward` where the Jacobian's gradient is an outer product, by_feature [points, width] times
+    """`grid_backward` where the Jacobian's gradient is an outer product, by_feature [points, levels, features] times
     directions [points, 3]."""
     num_features = table_grad.shape[1]
     for level in prange(layout.shape[0]):
@@ -139,9 +138,8 @@ def grid_backward_outer(positions, table_grad, layout, halves, features_grad, by
             fx, fy, fz, corners = _corners(positions[n], layout[level], half)
             vx, vy, vz = directions[n, 0] * half, directions[n, 1] * half, directions[n, 2] * half
             for f in range(num_features):
-                column = level * num_features + f
-                p = by_feature[n, column]
-                _scatter(table_grad, f, corners, fx, fy, fz, features_grad[n, column], p * vx, p * vy, p * vz)
+                p = by_feature[n, level, f]
+                _scatter(table_grad, f, corners, fx, fy, fz, features_grad[n, level, f], p * vx, p * vy, p * vz)
 
 
 class KernelInterpolation(torch.autograd.Function):
@@ -157,7 +155,9 @@ class KernelInterpolation(torch.autograd.Function):
         features = torch.empty(len(positions), columns, dtype=table.dtype)
         jacobian = torch.empty(len(positions) if with_jacobian else 0, columns, 3, dtype=table.dtype)
         arrays = (positions.numpy(), table.detach().numpy(), *levels_and_halves(layout, positions.numpy().dtype))
-        grid_forward(*arrays, features.numpy(), jacobian.numpy(), with_jacobian)
+        shape = (len(positions), len(layout), table.shape[1])
+        by_level = jacobian.view(*shape, 3) if with_jacobian else jacobian.view(0, *shape[1:], 3)
+        grid_forward(*arrays, features.view(shape).numpy(), by_level.numpy(), with_jacobian)
         ctx.save_for_backward(positions)
         ctx.layout, ctx.table_shape, ctx.with_jacobian = layout, table.shape, with_jacobian  # type: ignore[attr-defined]
         return features, jacobian
@@ -167,9 +167,13 @@ class KernelInterpolation(torch.autograd.Function):
         """Gradient of the table."""
         (positions,) = ctx.saved_tensors
         table_grad = torch.zeros(ctx.table_shape, dtype=positions.dtype)
-        grads = (features_grad.contiguous().numpy(), jacobian_grad.contiguous().numpy())
-        levels = levels_and_halves(ctx.layout, positions.numpy().dtype)
-        grid_backward(positions.numpy(), table_grad.numpy(), *levels, *grads, ctx.with_jacobian)
+        levels = (len(ctx.layout), ctx.table_shape[1])
+        grads = (
+            features_grad.contiguous().view(-1, *levels).numpy(),
+            jacobian_grad.contiguous().view(-1, *levels, 3).numpy(),
+        )
+        layout = levels_and_halves(ctx.layout, positions.numpy().dtype)
+        grid_backward(positions.numpy(), table_grad.numpy(), *layout, *grads, ctx.with_jacobian)
         return table_grad, None, None, None
 
 

@@ -74,7 +74,7 @@ class SurfaceField(nn.Module):
     ) -> SurfacePoint:
         """Signed distance and its gradient."""
         if positions.is_cuda or positions.dtype != torch.float32 or not len(positions):
-            distance, gradient = self.residual(positions, level_weights)
+            distance, gradient = self.residual(*self.grid.with_jacobian(positions, level_weights))
         else:
             levels = torch.ones(self.config.grid.num_levels) if level_weights is None else level_weights
             layers = (self.hidden.weight, self.hidden.bias, self.head.weight)
@@ -84,14 +84,14 @@ class SurfaceField(nn.Module):
         return SurfacePoint(distance + radius[..., 0], gradient + positions / radius)
 
     def residual(
-        self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
+        self, features: Float[Tensor, "points width"], jacobian: Float[Tensor, "points width 3"]
     ) -> SurfacePoint:
-        """What is added to the initial sphere, less the last layer's bias: the readable twin of `FusedSurface`.
+        """What is added to the initial sphere, less the last layer's bias, from what the hash grid gives.
 
-        The gradient of the small MLP is written out (softplus' is the sigmoid) and chained with the Jacobian of the
-        hash grid; both are ordinary differentiable functions of the parameters.
+        With the grid's own twin this is the readable twin of `FusedSurface`. The gradient of the small MLP is written
+        out (softplus' is the sigmoid) and chained with the Jacobian of the hash grid; both are ordinary differentiable
+        functions of the parameters.
         """
-        features, jacobian = self.grid.with_jacobian(positions, level_weights)
         hidden, slope = _SoftplusWithSlope.apply(self.hidden(features))
         by_feature = (slope * self.head.weight) @ self.hidden.weight
         gradient = torch.einsum("nf,nfi->ni", by_feature, jacobian)

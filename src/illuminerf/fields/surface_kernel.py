@@ -54,28 +54,30 @@ def softplus_with_slope(value):
 @njit(parallel=True, cache=True, fastmath=FAST)
 @no_type_check
 def _forward_layers(features, jacobian, first, bias, last, by_feature, hidden, slope, distance, gradient):
-    width, num_hidden = first.shape
+    num_levels, num_features, num_hidden = first.shape
     for n in prange(features.shape[0]):
-        x, p, h, s = features[n], by_feature[n], hidden[n], slope[n]
+        h, s = hidden[n], slope[n]
         for k in range(num_hidden):
             h[k] = bias[k]
-        for f in range(width):
-            value = x[f]
-            for k in range(num_hidden):
-                h[k] += value * first[f, k]
+        for level in range(num_levels):
+            for f in range(num_features):
+                value = features[n, level, f]
+                for k in range(num_hidden):
+                    h[k] += value * first[level, f, k]
         total = _ZERO
         for k in range(num_hidden):
             h[k], s[k] = softplus_with_slope(h[k])
             total += h[k] * last[k]
         gx = gy = gz = _ZERO
-        for f in range(width):
-            value = _ZERO
-            for k in range(num_hidden):
-                value += first[f, k] * (s[k] * last[k])
-            p[f] = value
-            gx += value * jacobian[n, f, 0]
-            gy += value * jacobian[n, f, 1]
-            gz += value * jacobian[n, f, 2]
+        for level in range(num_levels):
+            for f in range(num_features):
+                value = _ZERO
+                for k in range(num_hidden):
+                    value += first[level, f, k] * (s[k] * last[k])
+                by_feature[n, level, f] = value
+                gx += value * jacobian[n, level, f, 0]
+                gy += value * jacobian[n, level, f, 1]
+                gz += value * jacobian[n, level, f, 2]
         distance[n] = total
         gradient[n, 0], gradient[n, 1], gradient[n, 2] = gx, gy, gz
 
@@ -86,36 +88,37 @@ def _backward_layers(
     features, jacobian, hidden, slope, first, last, distance_grad, gradient_grad,
     features_grad, first_grads, bias_grads, last_grads,
 ):  # fmt: skip
-    num_points, width, num_hidden = features.shape[0], first.shape[0], first.shape[1]
+    num_points, (num_levels, num_features, num_hidden) = features.shape[0], first.shape
     num_parts = first_grads.shape[0]
     for part in prange(num_parts):
         first_grad, bias_grad, last_grad = first_grads[part], bias_grads[part], last_grads[part]
         pre = np.empty(num_hidden, np.float32)
         scaled = np.empty(num_hidden, np.float32)
-        q = np.empty(width, np.float32)
+        q = np.empty((num_levels, num_features), np.float32)
         for n in range(part * num_points // num_parts, (part + 1) * num_points // num_parts):
             g, vx, vy, vz = distance_grad[n], gradient_grad[n, 0], gradient_grad[n, 1], gradient_grad[n, 2]
-            x, h, s = features[n], hidden[n], slope[n]
-            for f in range(width):
-                q[f] = jacobian[n, f, 0] * vx + jacobian[n, f, 1] * vy + jacobian[n, f, 2] * vz
+            h, s = hidden[n], slope[n]
             for k in range(num_hidden):
                 pre[k] = _ZERO
-            for f in range(width):
-                value = q[f]
-                for k in range(num_hidden):
-                    pre[k] += value * first[f, k]
+            for level in range(num_levels):
+                for f in range(num_features):
+                    jx, jy, jz = jacobian[n, level, f, 0], jacobian[n, level, f, 1], jacobian[n, level, f, 2]
+                    q[level, f] = jx * vx + jy * vy + jz * vz
+                    for k in range(num_hidden):
+                        pre[k] += q[level, f] * first[level, f, k]
             for k in range(num_hidden):
                 r = pre[k]
                 last_grad[k] += g * h[k] + s[k] * r
                 scaled[k] = s[k] * last[k]
                 pre[k] = last[k] * (s[k] * g + _SHARPNESS * s[k] * (_ONE - s[k]) * r)
                 bias_grad[k] += pre[k]
-            for f in range(width):
-                total, value, slopes = _ZERO, x[f], q[f]
-                for k in range(num_hidden):
-                    total += first[f, k] * pre[k]
-                    first_grad[f, k] += value * pre[k] + slopes * scaled[k]
-                features_grad[n, f] = total
+            for level in range(num_levels):
+                for f in range(num_features):
+                    total, value, slopes = _ZERO, features[n, level, f], q[level, f]
+                    for k in range(num_hidden):
+                        total += first[level, f, k] * pre[k]
+                        first_grad[level, f, k] += value * pre[k] + slopes * scaled[k]
+                    features_grad[n, level, f] = total
 
 
 class FusedSurface(torch.autograd.Function):
@@ -131,34 +134,43 @@ class FusedSurface(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """`weight` [hidden, width] and `last` [1, hidden] as torch's linear layers hold them."""
         positions = positions.detach().contiguous()
-        num_points, (num_hidden, width) = len(positions), weight.shape
-        features, jacobian = np.empty((num_points, width), np.float32), np.empty((num_points, width, 3), np.float32)
-        levels = levels_and_halves(layout, features.dtype)
+        num_points, num_hidden, num_features = len(positions), len(weight), table.shape[1]
+        levels = levels_and_halves(layout, np.dtype(np.float32))
+        features, jacobian, by_feature = (
+            _levels_outermost(len(layout), num_points, num_features, *rest) for rest in ((), (3,), ())
+        )
         grid_forward(positions.numpy(), table.detach().numpy(), *levels, features, jacobian, True)
-        columns = np.repeat(level_weights.detach().numpy().astype(np.float32), table.shape[1])
-        features *= columns
-        jacobian *= columns[:, None]
-        shapes = ((width,), (num_hidden,), (num_hidden,), (), (3,))
-        by_feature, hidden, slope, distance, gradient = (np.empty((num_points, *s), np.float32) for s in shapes)
-        first = np.ascontiguousarray(weight.detach().numpy().T)
+        scales = level_weights.detach().numpy().astype(np.float32)[:, None]
+        features *= scales
+        jacobian *= scales[..., None]
+        hidden, slope, distance, gradient = (
+            np.empty((num_points, *shape), np.float32) for shape in ((num_hidden,), (num_hidden,), (), (3,))
+        )
+        first = np.ascontiguousarray(weight.detach().numpy().T).reshape(len(layout), num_features, num_hidden)
         layers = (first, bias.detach().numpy(), last.detach().numpy()[0])
         _forward_layers(features, jacobian, *layers, by_feature, hidden, slope, distance, gradient)
         ctx.arrays = (features, jacobian, hidden, slope, first, layers[2].copy())  # type: ignore[attr-defined]
-        ctx.grid = (positions.numpy(), table.shape, levels, columns, by_feature)  # type: ignore[attr-defined]
+        ctx.grid = (positions.numpy(), table.shape, levels, scales, by_feature)  # type: ignore[attr-defined]
         return torch.from_numpy(distance), torch.from_numpy(gradient)
 
     @staticmethod
     def backward(ctx, distance_grad: Tensor, gradient_grad: Tensor):  # type: ignore[no-untyped-def]
         """Gradients of table, weight, bias and last layer."""
-        features, first = ctx.arrays[0], ctx.arrays[4]
-        positions, table_shape, levels, columns, by_feature = ctx.grid
+        first = ctx.arrays[4]
+        positions, table_shape, levels, scales, by_feature = ctx.grid
         incoming = (distance_grad.contiguous().numpy(), gradient_grad.contiguous().numpy())
-        features_grad = np.empty_like(features)
-        sums = [np.zeros((_NUM_PARTS, *shape), np.float32) for shape in (first.shape, first.shape[1:], first.shape[1:])]
+        num_hidden = first.shape[-1]
+        features_grad = _levels_outermost(len(first), len(positions), first.shape[1])
+        sums = [np.zeros((_NUM_PARTS, *shape), np.float32) for shape in (first.shape, (num_hidden,), (num_hidden,))]
         _backward_layers(*ctx.arrays, *incoming, features_grad, *sums)
         table_grad = torch.zeros(table_shape)
-        grid_backward_outer(
-            positions, table_grad.numpy(), *levels, features_grad * columns, by_feature * columns, incoming[1]
-        )
+        features_grad *= scales
+        grid_backward_outer(positions, table_grad.numpy(), *levels, features_grad, by_feature * scales, incoming[1])
         first_grad, bias_grad, last_grad = (torch.from_numpy(part.sum(0)) for part in sums)
-        return table_grad, first_grad.T.contiguous(), bias_grad, last_grad[None], None, None, None
+        weight_grad = first_grad.view(-1, num_hidden).T.contiguous()
+        return table_grad, weight_grad, bias_grad, last_grad[None], None, None, None
+
+
+def _levels_outermost(num_levels: int, num_points: int, *rest: int) -> np.ndarray:
+    """Uninitialised float32 [points, levels, ...] that lies in memory level by level."""
+    return np.empty((num_levels, num_points, *rest), np.float32).swapaxes(0, 1)
