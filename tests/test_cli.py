@@ -111,6 +111,7 @@ def test_benchmark_asks_for_what_it_needs(tmp_path: Path, capsys: pytest.Capture
         ["benchmark", "stanford-orb", "--help"],
         ["benchmark", "stanford-orb-illumination", "--help"],
         ["data", "synthetic-orb", "--help"],
+        ["data", "tensoir-gallery", "--help"],
         ["benchmark", "report", "--help"],
         ["models", "download", "--help"],
         *([command, "--help"] for command in COMMANDS),

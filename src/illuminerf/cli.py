@@ -280,6 +280,7 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
         "preview": preview_command,
         "download-objaverse": download_objaverse_command,
         "example-assets": example_assets_command,
+        "tensoir-gallery": datasets.tensoir_gallery_command,
         "synthetic-orb": datasets.synthetic_orb_command,
     },
     "models": {
