@@ -14,8 +14,8 @@ _DIGITS = {"psnr_h": 2, "psnr_l": 2, "ssim": 3, "lpips": 3}
 def capture_table(scores: Mapping[str, Any]) -> Table:
     """One row per capture and target light, of what `score_orb_predictions` returns, and the mean over captures."""
     table = Table(title="Relighting, per capture and target light")
-    table.add_column("capture")
-    table.add_column("light of")
+    for heading in ("capture", "light of"):
+        table.add_column(heading, overflow="fold")
     for heading in (*_HEADINGS.values(), "images", "missing"):
         table.add_column(heading, justify="right")
     for capture, targets in scores["images"].items():
@@ -46,17 +46,19 @@ def study_table(methods: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Tab
     """Means by method against references under a fixed and a per-image light ("fixed", "per_image"), above the
     paper's."""
     table = Table(title="Against renderings of the scanned objects (rows marked *: published, 14 objects, 3 lights)")
-    for heading in ("method", "its light"):
-        table.add_column(heading)
-    for reference in ("fixed", "per image"):
-        for heading in _HEADINGS.values():
-            table.add_column(f"{reference}: {heading}", justify="right")
+    table.add_column("method")
+    for heading in ("relit under", "reference"):
+        table.add_column(heading, no_wrap=True)
+    for heading in _HEADINGS.values():
+        table.add_column(heading, justify="right")
     for name, means in methods.items():
-        table.add_row(name, "", *_cells(means["fixed"]), *_cells(means["per_image"]))
+        for reference in ("fixed", "per_image"):
+            table.add_row(name, "", reference.replace("_", " "), *_cells(means[reference]))
     table.add_section()
     for row in ILLUMINATION_STUDY:
-        values = (dict(zip(_HEADINGS, numbers, strict=True)) for numbers in (row.fixed, row.per_image))
-        table.add_row(f"{row.method} *", row.illumination, *(cell for means in values for cell in _cells(means)))
+        for reference, numbers in (("fixed", row.fixed), ("per image", row.per_image)):
+            cells = _cells(dict(zip(_HEADINGS, numbers, strict=True)))
+            table.add_row(f"{row.method} *", row.illumination, reference, *cells)
     return table
 
 
