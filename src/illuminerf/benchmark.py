@@ -24,6 +24,7 @@ from illuminerf.stages.score_predictions import score_input_light, score_predict
 from illuminerf.workflow.atomic import write_bytes, write_json
 from illuminerf.workflow.device import resolve_device
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.named_folders import named_folders
 from illuminerf.workflow.progress import console, say, track
 
 _ESTIMATES = {
@@ -119,7 +120,7 @@ def report_command(
     pictures: Iterable[CellPictures] = ()
     if root is not None:
         cells = all_cells(methods)
-        shown = compare_renderings(root, _rendered(methods, _named_folders(renderings)), cells, views)
+        shown = compare_renderings(root, _rendered(methods, named_folders(renderings)), cells, views)
         pictures = track(shown, "pictures", len(cells))
     write_bytes(out, score_page(methods, pictures, title))
     write_bytes(out.with_suffix(".tex"), latex_tables(methods).encode())
@@ -200,21 +201,6 @@ def relight_scene(
     for light in lights:
         rendered = out / scene.name / "lights" / light / "test_views"
         write_predictions(rendered, names, out / "predictions" / scene.name / light)
-
-
-def _named_folders(renderings: Sequence[str]) -> dict[str, Path]:
-    folders: dict[str, Path] = {}
-    for argument in renderings:
-        name, _, folder = argument.partition("=")
-        if not name or not folder or name in folders or not Path(folder).is_dir():
-            raise UserError(
-                "renderings cannot be found by this",
-                got=f"--renderings {argument}",
-                wanted="NAME=FOLDER, each name once, each folder there",
-                fix="check the name and the path",
-            )
-        folders[name] = Path(folder)
-    return folders
 
 
 def _rendered(methods: Sequence[MethodScores], folders: dict[str, Path]) -> list[RenderedMethod]:

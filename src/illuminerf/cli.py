@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar
 import tyro
 from rich.markup import escape
 
-from illuminerf import ablation, benchmark, demo, models, pipeline
+from illuminerf import ablation, benchmark, datasets, demo, models, orb_illumination_study, pipeline, stanford_orb
 from illuminerf.data.objaverse_download import download_objaverse
 from illuminerf.data.object_collection import read_ids
 from illuminerf.presets import PRESETS, Preset, customised
@@ -271,6 +271,8 @@ COMMANDS: dict[str, Callable[..., Any]] = {
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
     "benchmark": {
         "tensoir": benchmark.tensoir_command,
+        "stanford-orb": stanford_orb.stanford_orb_command,
+        "stanford-orb-illumination": orb_illumination_study.illumination_study_command,
         "ablation": ablation.ablation_command,
         "report": benchmark.report_command,
     },
@@ -278,6 +280,8 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
         "preview": preview_command,
         "download-objaverse": download_objaverse_command,
         "example-assets": example_assets_command,
+        "tensoir-gallery": datasets.tensoir_gallery_command,
+        "synthetic-orb": datasets.synthetic_orb_command,
     },
     "models": {
         "list": models.list_command,

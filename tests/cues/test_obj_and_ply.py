@@ -10,7 +10,7 @@ from PIL import Image
 
 from illuminerf.cues.broken_object import BrokenObject
 from illuminerf.cues.materials import Material, Parts
-from illuminerf.cues.object_files import ObjectReading, UpAxis, load_object
+from illuminerf.cues.object_files import ObjectReading, UpAxis, load_object, load_object_in_place
 from illuminerf.cues.raw_objects import ReadingLimits
 from illuminerf.scene.images import linear_from_srgb
 from tests.cues.made_objects import FACES, TETRAHEDRON, png
@@ -48,6 +48,24 @@ def test_obj_is_y_up_unless_told(tmp_path: Path) -> None:
         ((mesh, _),) = load(path, axis)  # type: ignore[arg-type]
         assert np.ptp(mesh.vertices, axis=0).argmax() == tallest
         assert len(mesh.faces) == 4 and np.linalg.norm(mesh.vertices, axis=1).max() == pytest.approx(1, abs=1e-6)
+
+
+def test_in_place_nothing_moves(tmp_path: Path) -> None:
+    path = obj(tmp_path, PLAIN.replace("v 0 0 1", "v 30 40 1"))
+    ((mesh, _),) = load_object_in_place(path, np.random.default_rng(0))
+    wanted = {(0, 0, 0), (1, 0, 0), (0, 5, 0), (30, 40, 1)}
+    assert {tuple(np.round(vertex, 3) + 0.0) for vertex in mesh.vertices.tolist()} == wanted
+    ((moved, _),) = load(path, "z")
+    assert np.abs(moved.vertices).max() <= 1
+
+
+def test_one_picture_may_hold_roughness_and_metalness(tmp_path: Path) -> None:
+    (tmp_path / "ks.png").write_bytes(png((10, 102, 204)))
+    packed = material_of(tmp_path, "bsdf pbr\nKd 1 1 1\nmap_Ks ks.png\n")
+    np.testing.assert_allclose(np.asarray(packed.roughness), 102 / 255, atol=1e-3)
+    np.testing.assert_allclose(np.asarray(packed.metallic), 204 / 255, atol=1e-3)
+    specular = material_of(tmp_path, "Kd 1 1 1\nmap_Ks ks.png\n")
+    assert not specular.is_textured, "elsewhere map_Ks is a specular colour"
 
 
 def test_ply_is_z_up_unless_told(tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
 """The benchmark's rule against a straightforward transcription, and what each part of it does."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from illuminerf.evaluation.benchmark_rule import ViewPair, channel_scale, on_white, score_light, view_pair
 from illuminerf.evaluation.rescaling import least_squares_scale, median_ratio, rescaled_inside
@@ -24,9 +26,9 @@ def random_views(seed: int, num_views: int = 3, size: int = 24) -> tuple[list[np
     return predictions, truths
 
 
-def transcription(predictions: list[np.ndarray], truths: list[np.ndarray]) -> list[float]:
-    """The rule of the published script, in plain loops over views and channels, from 8-bit files in
-    float64.
+def compared_images(predictions: list[np.ndarray], truths: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(prediction as it is scored, truth on white) by the rule of the published script, in plain loops over views and
+    channels, from 8-bit files in float64.
     """
     predictions, truths = (
         [np.rint(image * 255.0).astype(np.uint8) / 255.0 for image in images] for images in (predictions, truths)
@@ -39,7 +41,7 @@ def transcription(predictions: list[np.ndarray], truths: list[np.ndarray]) -> li
             divided = white[mask][:, channel] / np.clip(prediction[mask][:, channel], 1e-6, 1)
             ratios[channel].extend(divided.tolist())
     factors = [float(np.median(values)) for values in ratios]
-    scores = []
+    compared = []
     for prediction, truth in zip(predictions, truths, strict=True):
         white = truth[..., :3] * truth[..., 3:] + (1 - truth[..., 3:])
         mask = truth[..., 3] > 0.5
@@ -47,8 +49,14 @@ def transcription(predictions: list[np.ndarray], truths: list[np.ndarray]) -> li
         for channel in range(3):
             plane = scored[..., channel]
             plane[mask] = (np.clip(plane[mask] * factors[channel], 0, 1) * 255).astype(np.uint8) / 255
-        scores.append(float(-10 * np.log10(np.mean((scored - white) ** 2))))
-    return scores
+        compared.append((scored, white))
+    return compared
+
+
+def transcription(predictions: list[np.ndarray], truths: list[np.ndarray]) -> list[float]:
+    """PSNR per view."""
+    pairs = compared_images(predictions, truths)
+    return [float(-10 * np.log10(np.mean((scored - white) ** 2))) for scored, white in pairs]
 
 
 def pairs_of(predictions: list[np.ndarray], truths: list[np.ndarray]) -> list[ViewPair]:
@@ -61,6 +69,25 @@ def test_scores_agree_with_the_transcription(seed: int) -> None:
     predictions, truths = random_views(seed)
     scores = score_light(pairs_of(predictions, truths))
     np.testing.assert_allclose(scores.psnr, transcription(predictions, truths), atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_scores_agree_with_scikit_image_on_the_transcribed_images(seed: int) -> None:
+    predictions, truths = random_views(seed)
+    scores, raw = (score_light(pairs_of(predictions, truths), rescale) for rescale in ("median", "none"))
+    for view, (scored, white) in enumerate(compared_images(predictions, truths)):
+        similarity = structural_similarity(
+            scored,
+            white,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+            data_range=1.0,
+            channel_axis=-1,
+        )
+        assert scores.psnr[view] == pytest.approx(peak_signal_noise_ratio(white, scored, data_range=1.0), abs=1e-4)
+        assert scores.ssim[view] == pytest.approx(similarity, abs=1e-4)
+        assert abs(raw.psnr[view] - scores.psnr[view]) > 1e-2 and abs(raw.ssim[view] - similarity) > 1e-3
 
 
 def test_the_tolerance_tells_other_rules_apart() -> None:

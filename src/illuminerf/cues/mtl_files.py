@@ -5,6 +5,7 @@ Kd, map_Kd            base colour; Kd is linear, as Blender writes and reads it;
 Ns                    highlight exponent: alpha = sqrt(2 / (Ns + 2)), the GGX lobe as wide as Blinn's, and
                       roughness = sqrt(alpha). A black Ks, or illum 0 or 1, means no highlight: roughness 1
 Pr, Pm, map_Pr, map_Pm, norm  the physically based extension, used as it stands
+bsdf pbr              as NVDiffRec writes it: map_Ks holds roughness in green and metalness in blue
 d, Tr, map_d          opacity; anything below 250/255 is (semi-)transparent
 map_Bump, bump        used where the picture looks like tangent-space normals; heights are left out
 Ka, Ks, Ke, ...       left out; Phong's specular colour has no counterpart but metals, which it was seldom meant for
@@ -75,6 +76,9 @@ def _material(
     if opacity is None:
         opacity = 1.0 - (number("tr") or 0.0)
     rough, metal = image("map_pr"), image("map_pm")
+    packs = lines.get("bsdf") == ["pbr"] and bool(lines.get("map_ks")) and rough is None and metal is None
+    if packs:
+        rough = metal = image("map_ks")
     roughness = 1.0 if rough is not None else number("pr")
     metallic = 1.0 if metal is not None else number("pm")
     normal = image("norm", "map_kn")
@@ -94,6 +98,8 @@ def _material(
         metallic=None if metallic is None else float(np.clip(metallic, 0, 1)),
         roughness_image=rough,
         metallic_image=metal,
+        roughness_channel=1 if packs else 0,
+        metallic_channel=2 if packs else 0,
         normal_image=normal,
         normal_scale=1.0 if normal is None else _bump_multiplier(lines),
     )

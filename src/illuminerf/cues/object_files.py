@@ -16,7 +16,7 @@ from illuminerf.cues.broken_object import BrokenObject
 from illuminerf.cues.gltf_scenes import read_gltf
 from illuminerf.cues.materials import Material, Parts
 from illuminerf.cues.obj_files import read_obj
-from illuminerf.cues.object_geometry import merged_by_material, normalized
+from illuminerf.cues.object_geometry import Bounds, merged_by_material, normalized
 from illuminerf.cues.object_textures import MaterialMaker, lets_light_through, transparent
 from illuminerf.cues.ply_files import read_ply
 from illuminerf.cues.raw_objects import RawMaterial, RawPart, ReadingLimits
@@ -102,9 +102,26 @@ def load_object(path: Path, generator: np.random.Generator, config: ObjectReadin
         UserError: the file cannot be opened or read, for which the disk is to blame and not the object.
     """
     config = config or ObjectReading()
+    return _loaded(path, _world_from_file(path, config.up_axis), generator, config)[0]
+
+
+def load_object_in_place(path: Path, generator: np.random.Generator, config: ObjectReading | None = None) -> Parts:
+    """As `load_object`, but axes, place and size are the file's own, as of a mesh that belongs to given cameras."""
+    parts, bounds = _loaded(path, np.eye(3), generator, config or ObjectReading())
+    placed = []
+    for mesh, material in parts:
+        vertices = (mesh.vertices * bounds.radius + bounds.centre).astype(np.float32)
+        placed.append((TriangleMesh(vertices, mesh.faces, mesh.vertex_normals), material))
+    return placed
+
+
+def _loaded(
+    path: Path, world_from_file: np.ndarray, generator: np.random.Generator, config: ObjectReading
+) -> tuple[Parts, Bounds]:
     raw = _read(path, config.limits)
     try:
-        return _made(path, raw, generator, config)
+        parts, bounds = normalized(path.name, raw, world_from_file)
+        return _made(path, parts, generator, config), bounds
     except BrokenObject:
         raise
     except (UserError, *_BAD_CONTENT) as error:
@@ -112,8 +129,8 @@ def load_object(path: Path, generator: np.random.Generator, config: ObjectReadin
 
 
 def _made(path: Path, parts: list[RawPart], generator: np.random.Generator, config: ObjectReading) -> Parts:
-    """Raw parts placed, with their textures decoded."""
-    parts = merged_by_material(normalized(path.name, parts, _world_from_file(path, config.up_axis)))
+    """Placed raw parts as meshes, with their textures decoded."""
+    parts = merged_by_material(parts)
     config.limits.check_faces(path.name, sum(len(part.faces) for part in parts))
     for part in parts:
         is_clear = part.material is None and part.color_alpha < _OPAQUE_VERTICES

@@ -15,13 +15,19 @@ _MIN_TOTAL_AREA = 1e-8
 
 
 @dataclass(frozen=True)
-class _Bounds:
+class Bounds:
+    """Where an object lies in its file's frame."""
+
     centre: np.ndarray
+    """Of its bounding box."""
     radius: float
+    """Of the sphere about the centre that holds it."""
 
 
-def normalized(name: str, parts: list[RawPart], world_from_file: np.ndarray) -> list[RawPart]:
+def normalized(name: str, parts: list[RawPart], world_from_file: np.ndarray) -> tuple[list[RawPart], Bounds]:
     """Turn parts by `world_from_file` [3, 3], centre their bounding box and scale them into the unit sphere.
+
+    Also returns where they were.
 
     All in float64, so that an object far from its origin keeps what precision its file has. Faces without area and
     vertices without faces are dropped, every vertex gets a unit normal.
@@ -45,7 +51,7 @@ def normalized(name: str, parts: list[RawPart], world_from_file: np.ndarray) -> 
             placed.append(part)
     if sum(_double_areas(part).sum() for part in placed) / 2 < _MIN_TOTAL_AREA:
         raise BrokenObject("degenerate", f"{name} has no surface", got="triangles without area")
-    return [_with_normals(part) for part in placed]
+    return [_with_normals(part) for part in placed], bounds
 
 
 def merged_by_material(parts: list[RawPart]) -> list[RawPart]:
@@ -68,7 +74,7 @@ def _joined(parts: list[RawPart]) -> RawPart:
     return replace(parts[0], faces=faces, color_alpha=min(part.color_alpha for part in parts), **stacked)  # type: ignore[arg-type]
 
 
-def _bounds(name: str, parts: list[RawPart]) -> _Bounds:
+def _bounds(name: str, parts: list[RawPart]) -> Bounds:
     low = np.min([part.vertices.min(0) for part in parts], axis=0)
     high = np.max([part.vertices.max(0) for part in parts], axis=0)
     if not (np.isfinite(low).all() and np.isfinite(high).all() and np.isfinite(high - low).all()):
@@ -79,7 +85,7 @@ def _bounds(name: str, parts: list[RawPart]) -> _Bounds:
     if size <= 0:
         raise BrokenObject("degenerate", f"{name} is a single point", got=f"all vertices at {centre}")
     radius = size * max(float(np.linalg.norm((part.vertices - centre) / size, axis=1).max()) for part in parts)
-    return _Bounds(centre, radius)
+    return Bounds(centre, radius)
 
 
 def _double_areas(part: RawPart) -> np.ndarray:

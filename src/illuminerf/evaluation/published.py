@@ -94,6 +94,32 @@ STANFORD_ORB = (
 
 
 @dataclass(frozen=True)
+class PublishedStudy:
+    """One row of the paper's study of illumination: against renderings of the scanned objects, not photographs."""
+
+    method: str
+    illumination: str
+    """Under which lights the method relit: one per object and lighting, or that measured for each image."""
+    fixed: tuple[float, float, float, float]
+    """PSNR-H, PSNR-L, SSIM, LPIPS against references under one light."""
+    per_image: tuple[float, float, float, float]
+    """Against references under the light of each image."""
+
+
+ILLUMINATION_STUDY = (
+    PublishedStudy("IllumiNeRF, one GPU", "fixed", (26.34, 32.53, 0.974, 0.029), (26.05, 32.17, 0.973, 0.029)),
+    PublishedStudy("IllumiNeRF", "fixed", (26.29, 32.45, 0.973, 0.029), (26.00, 32.11, 0.973, 0.029)),
+    PublishedStudy("NVDiffRecMC", "per image", (25.17, 31.19, 0.970, 0.037), (25.45, 31.53, 0.970, 0.036)),
+    PublishedStudy("InvRender", "per image", (24.50, 30.75, 0.970, 0.047), (24.68, 30.93, 0.971, 0.046)),
+    PublishedStudy("NeRFactor", "per image", (24.38, 30.70, 0.970, 0.049), (24.55, 30.85, 0.970, 0.048)),
+    PublishedStudy("NeRD", "per image", (24.05, 30.20, 0.968, 0.053), (24.22, 30.36, 0.969, 0.053)),
+    PublishedStudy("NVDiffRec", "per image", (23.47, 29.35, 0.960, 0.037), (23.71, 29.60, 0.960, 0.037)),
+    PublishedStudy("PhySG", "per image", (22.55, 28.05, 0.959, 0.056), (22.71, 28.19, 0.959, 0.055)),
+    PublishedStudy("the photographs", "-", (26.25, 32.69, 0.975, 0.024), (26.73, 33.27, 0.977, 0.023)),
+)
+
+
+@dataclass(frozen=True)
 class GalleryScores:
     """PSNR in dB of one scene and light: frames of the paper's gallery videos under this rule, every 20th
     view.

@@ -15,6 +15,7 @@ from illuminerf.scene.radiance_hdr import read_hdr
 from illuminerf.workflow.errors import UserError
 
 _UNDERSHOOT = 0.05  # of the mean radiance
+_TURNING_SAMPLES = 3  # of the old map, along each side of a new pixel
 _LDR_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -103,6 +104,19 @@ class EnvironmentMap:
             return replace(self, linear_rgb=left)
         return replace(self, linear_rgb=(1 - part) * left + part * np.roll(left, -1, axis=1))
 
+    def turned(self, rotation: np.ndarray) -> "EnvironmentMap":
+        """Turn the light by any rotation [3, 3]: what came from direction d comes from `rotation @ d`."""
+        height = self.linear_rgb.shape[0]
+        fine = EnvironmentMap(np.ones((height * _TURNING_SAMPLES, 2 * height * _TURNING_SAMPLES, 3), np.float32))
+        weights = fine.solid_angles().astype(np.float32)  # pixels near the poles are averaged by area
+        rows = []
+        for row in range(height):
+            band = slice(row * _TURNING_SAMPLES, (row + 1) * _TURNING_SAMPLES)
+            values = self.radiance(fine.directions(band) @ rotation.astype(np.float32)) * weights[band]
+            cells = values.reshape(_TURNING_SAMPLES, 2 * height, _TURNING_SAMPLES, 3).sum((0, 2))
+            rows.append(cells / (_TURNING_SAMPLES * weights[band].sum()))
+        return replace(self, linear_rgb=np.stack(rows))
+
     def exposed(self, stops: float) -> "EnvironmentMap":
         """Multiply the radiance by 2^stops."""
         return replace(self, linear_rgb=(self.linear_rgb * np.float32(2.0**stops)).astype(np.float32))
@@ -116,10 +130,10 @@ class EnvironmentMap:
         small = np.einsum("hH,HWc->hWc", rows, self.linear_rgb.astype(np.float64), optimize=True)
         return replace(self, linear_rgb=np.einsum("wW,hWc->hwc", columns, small, optimize=True).astype(np.float32))
 
-    def directions(self) -> np.ndarray:
-        """Unit directions of the pixel centres, float32 [height, width, 3]."""
+    def directions(self, rows: slice = slice(None)) -> np.ndarray:
+        """Unit directions of the pixel centres, float32 [height, width, 3], of all rows or of some."""
         height, width = self.linear_rgb.shape[:2]
-        elevation = np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)
+        elevation = np.pi / 2 - (np.arange(height)[rows] + 0.5) * (np.pi / height)
         azimuth = np.pi - (np.arange(width) + 0.5) * (2 * np.pi / width)
         el, az = np.meshgrid(elevation, azimuth, indexing="ij")
         return np.stack([np.cos(az) * np.cos(el), np.sin(az) * np.cos(el), np.sin(el)], -1).astype(np.float32)

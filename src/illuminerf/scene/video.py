@@ -1,13 +1,17 @@
-"""Frames to MP4."""
+"""Frames to MP4 and back."""
 
-from collections.abc import Iterable
+import subprocess
+import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import imageio.v2 as imageio
+import imageio_ffmpeg
 import numpy as np
 
 from illuminerf.scene.images import to_uint8
 from illuminerf.workflow.atomic import atomic_path
+from illuminerf.workflow.errors import UserError
 
 
 def write_mp4(path: Path, frames: Iterable[np.ndarray], frames_per_second: int = 24) -> None:
@@ -33,4 +37,48 @@ def write_mp4(path: Path, frames: Iterable[np.ndarray], frames_per_second: int =
             even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
             writer.append_data(  # type: ignore[attr-defined]
                 np.ascontiguousarray(to_uint8(even))
+            )
+
+
+def video_size(path: Path) -> tuple[int, int]:
+    """(width, height) in pixels; UserError where the file is missing or no video."""
+    if not path.is_file():
+        raise UserError(f"the video {path} is missing", fix="check the path")
+    try:
+        reader = imageio_ffmpeg.read_frames(path)
+        width, height = next(reader)["size"]
+        reader.close()
+    except (OSError, RuntimeError, IndexError, KeyError, ValueError) as error:
+        raise UserError(
+            f"{path} is not a readable video", got=str(error).splitlines()[0], fix="copy it again"
+        ) from error
+    return int(width), int(height)
+
+
+def read_video(path: Path, size: int) -> Iterator[np.ndarray]:
+    """The frames of a square video, uint8 [size, size, 3], area-averaged.
+
+    Raises:
+        UserError: it cannot be decoded to its end.
+    """
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path)]
+    command += ["-vf", f"scale={size}:{size}:flags=area", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    num_bytes = size * size * 3
+    with (
+        tempfile.TemporaryFile() as messages,
+        subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=messages) as process,
+    ):
+        assert process.stdout is not None
+        try:
+            while len(frame := process.stdout.read(num_bytes)) == num_bytes:
+                yield np.frombuffer(frame, np.uint8).reshape(size, size, 3)
+        finally:  # also where the caller wants no more of them
+            process.stdout.close()
+            was_cut = process.poll() is None
+            status = process.wait()
+        messages.seek(0)
+        said = messages.read().decode(errors="replace").strip().splitlines()
+        if (status != 0 and not was_cut) or said or frame:
+            raise UserError(
+                f"{path} cannot be decoded", got=said[0] if said else "a frame that ends early", fix="copy it again"
             )
