@@ -46,6 +46,9 @@ EMBEDDED = Preset(
     name="embedded",
     description="The default: for two CPU cores and photographs of about 200 pixels; a GPU makes it faster.",
     capture=import_capture.Config(size=200),
+    geometry=estimate_geometry.Config(
+        optimiser=OptimiserConfig(num_steps=3000, rays_per_step=1024, warmup_steps=60), mesh_resolution=224
+    ),
     illumination=estimate_illumination.Config(sampling=CueSampling(samples_per_pixel=16)),
     # cheap; noise of the cues reaches the samples, and the distillation averages over views
     cues=render_radiance_cues.Config(sampling=CueSampling(samples_per_pixel=16)),
