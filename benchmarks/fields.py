@@ -18,7 +18,7 @@ import torch
 
 from illuminerf.fields.bounds import OccupiedCells, ball_interval
 from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss
-from illuminerf.fields.hash_grid import HashGridConfig, interpolate
+from illuminerf.fields.hash_grid import HashGrid, HashGridConfig, interpolate
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
 from illuminerf.fields.ray_pool import RayPool, gather_rays
 from illuminerf.fields.shading_cache import cache_shading, latent_loss
@@ -132,6 +132,24 @@ def kernels_against_twins(seconds: float, num_points: int = 1 << 17) -> dict[str
     result["grid_twin_over_kernel"] = result["grid_twin_ms"] / result["grid_kernel_ms"]
     result["surface_twin_over_kernel"] = result["surface_twin_ms"] / result["surface_kernel_ms"]
     return result
+
+
+def kernel_against_twin(seconds: float, device: torch.device, num_points: int = 1 << 17) -> dict[str, float]:
+    """Forward and backward of features and Jacobian at 16 levels: what the fields use on `device`, and its twin."""
+    grid = HashGrid(HashGridConfig(16, 2, 17, 16, 2048)).to(device)
+    positions = (torch.rand(num_points, 3, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9).to(device)
+
+    def kernel(_: int) -> None:
+        features, jacobian = grid.with_jacobian(positions)
+        (features.sum() + jacobian.sum()).backward()
+
+    def twin(_: int) -> None:
+        layout = (grid._resolutions, grid._sizes, grid._offsets)
+        features, jacobian = interpolate(positions, grid.table, *layout, with_jacobian=True)
+        (features.sum() + jacobian.sum()).backward()
+
+    fast, slow = seconds_per_call(kernel, seconds, device), seconds_per_call(twin, seconds, device)
+    return {"kernel_ms": 1e3 * fast, "twin_ms": 1e3 * slow, "twin_over_kernel": slow / fast}
 
 
 def main() -> None:
