@@ -55,7 +55,11 @@ def settings(root: Path) -> Preset:
     """All stages, tiny, with a relighting model that is not trained."""
     if not (root / "model").exists():
         save_model(with_noise_in_every_weight(tiny_model()), root / "model")
-    return dataclasses.replace(tiny(samples=2), relighting_model=str(root / "model"))
+    preset = tiny(samples=2)
+    # enough steps that codes show in 8-bit images: after a dozen, shuffled ones still render the same bytes
+    steps = dataclasses.replace(preset.latent_nerf.optimiser, num_steps=80)
+    latent_nerf = dataclasses.replace(preset.latent_nerf, optimiser=steps)
+    return dataclasses.replace(preset, latent_nerf=latent_nerf, relighting_model=str(root / "model"))
 
 
 def compare(scene: Path, out: Path) -> None:
@@ -80,8 +84,7 @@ def test_every_row_is_scored_and_stands_beside_the_published_one(finished: tuple
     made = [(row["num_samples"], row["uses_latents"], row["shuffles_latents"]) for row in rows]
     assert made == [(1, False, False), (1, True, False), (2, True, False), (2, True, True)]
     assert all(5 < row["psnr"] < 50 and 0 < row["ssim"] < 1 and row["train_psnr"] > 5 for row in rows)
-    # of the fits: scores of 8-bit images this small can coincide
-    assert len({row["train_psnr"] for row in rows}) == 4
+    assert len({row["psnr"] for row in rows}) == 4
     assert [row["published"] and row["published"]["psnr"] for row in rows] == [24.957, 26.321, None, None]
     assert {"cues", "relit", "geometry"} <= set(result["shared_seconds"])
     assert [row["consistency"]["codes_alpha"] for row in rows] == [None, 0, 0, 0]
