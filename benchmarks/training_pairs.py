@@ -27,6 +27,7 @@ from unittest.mock import patch
 import numpy as np
 
 from illuminerf.cues import item_renderer, object_views
+from illuminerf.cues.dents import DentVariation
 from illuminerf.cues.item_renderer import MitsubaItemRenderer, RenderedItem
 from illuminerf.cues.light_library import light_paths
 from illuminerf.cues.mitsuba_variant import load_mitsuba
@@ -111,6 +112,7 @@ def view_settings(options: argparse.Namespace) -> ViewSettings:
         cue_sampling=CueSampling(options.cue_samples, device=options.device),
         light_height=min(base.light_height, options.light_height),
         materials=base.materials if options.vary else MaterialVariation.none(),
+        dents=base.dents if options.vary else DentVariation(0.0),
         cameras=base.cameras if options.paper else CameraSphere(),
     )
 
@@ -165,8 +167,8 @@ def noise(first_views: list[tuple[tuple[Any, ...], RenderedItem]], settings: Vie
     sampling = dataclasses.replace(settings.cue_sampling, samples_per_pixel=samples)
     renderer = MitsubaItemRenderer(samples, sampling, settings.bakes_textures)
     rows: dict[str, list[list[float]]] = defaultdict(list)
-    for (parts, camera, lights, seed), item in first_views:
-        reference = renderer.render(parts, camera, lights[:1], seed + 1)
+    for (parts, camera, lights, seed, cue_mesh), item in first_views:
+        reference = renderer.render(parts, camera, lights[:1], seed + 1, cue_mesh)
         inside = reference.alpha > 0.5
         for name, image, wanted in zip((*CUE_NAMES, "target"), _pictures(item), _pictures(reference), strict=True):
             coded, truth = (srgb_from_linear(np.clip(x, 0, 1)) for x in (image, wanted))

@@ -154,9 +154,9 @@ class KernelInterpolation(torch.autograd.Function):
         columns = len(layout) * table.shape[1]
         features = torch.empty(len(positions), columns, dtype=table.dtype)
         jacobian = torch.empty(len(positions) if with_jacobian else 0, columns, 3, dtype=table.dtype)
-        arrays = (positions.numpy(), table.detach().numpy(), *levels_and_halves(layout, positions.numpy().dtype))
+        arrays = (positions.numpy(), table.detach().numpy(), layout, half_resolutions(layout, positions.numpy().dtype))
         shape = (len(positions), len(layout), table.shape[1])
-        by_level = jacobian.view(*shape, 3) if with_jacobian else jacobian.view(0, *shape[1:], 3)
+        by_level = jacobian.view(len(jacobian), *shape[1:], 3)
         grid_forward(*arrays, features.view(shape).numpy(), by_level.numpy(), with_jacobian)
         ctx.save_for_backward(positions)
         ctx.layout, ctx.table_shape, ctx.with_jacobian = layout, table.shape, with_jacobian  # type: ignore[attr-defined]
@@ -172,8 +172,8 @@ class KernelInterpolation(torch.autograd.Function):
             features_grad.contiguous().view(-1, *levels).numpy(),
             jacobian_grad.contiguous().view(-1, *levels, 3).numpy(),
         )
-        layout = levels_and_halves(ctx.layout, positions.numpy().dtype)
-        grid_backward(positions.numpy(), table_grad.numpy(), *layout, *grads, ctx.with_jacobian)
+        halves = half_resolutions(ctx.layout, positions.numpy().dtype)
+        grid_backward(positions.numpy(), table_grad.numpy(), ctx.layout, halves, *grads, ctx.with_jacobian)
         return table_grad, None, None, None
 
 
@@ -182,6 +182,6 @@ def kernel_layout(resolutions: list[int], sizes: list[int], offsets: list[int]) 
     return np.stack([np.array(column, np.int64) for column in (resolutions, sizes, offsets)], -1)
 
 
-def levels_and_halves(layout: np.ndarray, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
-    """The level table, and half of each resolution in the positions' type."""
-    return layout, np.asarray(layout[:, 0] / 2, dtype)
+def half_resolutions(layout: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Half of each level's resolution in the positions' type: numba would promote float32 beside an integer."""
+    return np.asarray(layout[:, 0] / 2, dtype)

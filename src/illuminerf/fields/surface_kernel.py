@@ -1,8 +1,8 @@
-"""Signed distance and its gradient on a CPU, in numba: hash grid, hidden layer and both derivatives in one pass.
+"""Signed distance and its gradient on a CPU, in numba: hash grid, hidden layer and both derivatives in one operation.
 
-The fast twin of `SurfaceField.residual`. What it saves over separate operations is memory: the Jacobian of the hash
-grid, [points, width, 3], never leaves the cache in the forward pass, and in the backward pass it is never formed at
-all, since the gradient that reaches it is an outer product (eikonal and normal losses see only `by_feature @ J`).
+The fast twin of `SurfaceField.residual`. What it saves over separate ones is traffic of memory: the hash grid writes
+its Jacobian level by level in one stretch each, and the gradient that would reach it, of the same size, is never
+formed, since it is an outer product (eikonal and normal losses see only `by_feature @ J`).
 
 Letters: h hidden units, f features, i axes; W [f, h] first layer, w [h] last layer, s slope of the softplus,
     distance   = w . softplus(W^T x + b) + bias          gradient_i = sum_f p_f J_fi,   p_f = sum_h W_fh s_h w_h
@@ -20,7 +20,7 @@ from numba import njit, prange
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from illuminerf.fields.hash_grid_kernel import FAST, grid_backward_outer, grid_forward, levels_and_halves
+from illuminerf.fields.hash_grid_kernel import FAST, grid_backward_outer, grid_forward, half_resolutions
 
 _NUM_PARTS = 16
 
@@ -135,7 +135,7 @@ class FusedSurface(torch.autograd.Function):
         """`weight` [hidden, width] and `last` [1, hidden] as torch's linear layers hold them."""
         positions = positions.detach().contiguous()
         num_points, num_hidden, num_features = len(positions), len(weight), table.shape[1]
-        levels = levels_and_halves(layout, np.dtype(np.float32))
+        levels = (layout, half_resolutions(layout, np.dtype(np.float32)))
         features, jacobian, by_feature = (
             _levels_outermost(len(layout), num_points, num_features, *rest) for rest in ((), (3,), ())
         )
