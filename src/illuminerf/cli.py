@@ -10,7 +10,17 @@ from typing import Annotated, Any, ClassVar
 import tyro
 from rich.markup import escape
 
-from illuminerf import ablation, benchmark, datasets, demo, models, orb_illumination_study, pipeline, stanford_orb
+from illuminerf import (
+    ablation,
+    benchmark,
+    datasets,
+    demo,
+    geometry_benchmark,
+    models,
+    orb_illumination_study,
+    pipeline,
+    stanford_orb,
+)
 from illuminerf.data.objaverse_download import download_objaverse
 from illuminerf.data.object_collection import read_ids
 from illuminerf.presets import PRESETS, Preset, customised
@@ -65,7 +75,7 @@ def relight_command(
         device: auto, cpu or cuda.
         rotate: Turns the light about the vertical axis, in degrees, counter-clockwise seen from above.
         exposure: Stops by which the light is made brighter.
-        background: Plain background to cut away where the photographs have no masks: white or black.
+        background: Background to cut away where the photographs have no masks: plain (any even colour), white or black.
         model: Another relighting model than the preset's: a folder, embedded or dilightnet.
     """
     settings = customised(
@@ -274,6 +284,7 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
         "stanford-orb": stanford_orb.stanford_orb_command,
         "stanford-orb-illumination": orb_illumination_study.illumination_study_command,
         "ablation": ablation.ablation_command,
+        "geometry": geometry_benchmark.geometry_command,
         "report": benchmark.report_command,
     },
     "data": {

@@ -80,7 +80,7 @@ class ShadedScene:
             third = scene.render_aovs("mapped:albedo", cameras, view, _PROPERTY_SAMPLES, 0)
             found["normal"] = _bent(found["normal"], first[..., 7:10], third[..., :3], found["coverage"])
         _, directions = cameras.image_rays(view)
-        found["normal"] = _toward_camera(found["normal"], first[..., 10:13], directions.numpy())
+        found["normal"] = toward_camera(found["normal"], first[..., 10:13], directions.numpy())
         return found
 
 
@@ -109,11 +109,17 @@ def render_shaded(
     srgb, alphas = [], []
     for view in range(len(cameras)):
         image = scene.render(cameras, view, light, samples_per_pixel, derived_seed(seed, "view", view))
-        alpha = np.clip(image[..., 3], 0, 1)
-        straight = image[..., :3] / np.maximum(alpha, 1e-6)[..., None]
-        srgb.append(np.where(alpha[..., None] > 0, srgb_from_linear(np.clip(straight, 0, 1)), 0))
-        alphas.append(alpha)
+        photograph = developed(image)
+        srgb.append(photograph[..., :3])
+        alphas.append(photograph[..., 3])
     return Views(cameras, np.stack(srgb).astype(np.float32), np.stack(alphas).astype(np.float32))
+
+
+def developed(image: np.ndarray) -> np.ndarray:
+    """Straight sRGB and coverage [h, w, 4], clipped like a photograph, of what `ShadedScene.render` returns."""
+    alpha = np.clip(image[..., 3:], 0, 1)
+    straight = np.clip(image[..., :3] / np.maximum(alpha, 1e-6), 0, 1)
+    return np.concatenate([np.where(alpha > 0, srgb_from_linear(straight), 0), alpha], -1)
 
 
 def concatenated(meshes: list[TriangleMesh]) -> TriangleMesh:
@@ -221,7 +227,7 @@ def _bent(normal: np.ndarray, tangent: np.ndarray, coded: np.ndarray, coverage: 
     return np.where(coverage[..., None] > 0, bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-6), 0)
 
 
-def _toward_camera(normal: np.ndarray, flat: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def toward_camera(normal: np.ndarray, flat: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Unit normals [h, w, 3] on the side of the face that is seen; where a smooth or mapped one leans over the horizon
     all the same, it is laid onto it, for turning it round would point it into the surface."""
     flat = np.where((flat * directions).sum(-1, keepdims=True) > 0, -flat, flat)

@@ -96,5 +96,57 @@ def ablation_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
+GEOMETRY_COLUMNS = (
+    ("normals, deg", "normal_degrees", 2),
+    ("median", "normal_median_degrees", 2),
+    ("gradient", "gradient_normal_degrees", 2),
+    ("faces", "face_normal_degrees", 2),
+    ("Chamfer, %", "chamfer_percent", 3),
+    ("F 0.5%", "f_score_half_percent", 3),
+    ("F 1%", "f_score_1_percent", 3),
+    ("mask IoU", "mask_iou", 4),
+    ("PSNR", "psnr", 2),
+    ("floaters", "floater_share", 4),
+    ("fit s", "fit_seconds", 0),
+)
+"""Heading, key in scores.json, digits."""
+
+
+def geometry_table(objects: Mapping[str, Mapping[str, Any]], mean: Mapping[str, float]) -> Table:
+    """One row per object, and their mean."""
+    table = Table(title="Estimated geometry against the truth, in unseen views and over the surface that is seen")
+    for heading in ("object", "light"):
+        table.add_column(heading)
+    for heading, _, _ in GEOMETRY_COLUMNS:
+        table.add_column(heading, justify="right")
+    for name, scores in objects.items():
+        table.add_row(name, scores["light"], *_geometry_cells(scores))
+    table.add_section()
+    table.add_row("mean", "", *_geometry_cells(mean))
+    return table
+
+
+def geometry_ablation_table(ablations: Mapping[str, Mapping[str, Any]]) -> Table:
+    """One row per ablation: means over those objects that it and the full method reconstructed, and how far they are
+    from the full method's."""
+    table = Table(title="Geometry with one part of the method changed (second line: change against the full method)")
+    for heading in ("ablation", "objects"):
+        table.add_column(heading)
+    for heading, _, _ in GEOMETRY_COLUMNS:
+        table.add_column(heading, justify="right")
+    for name, found in ablations.items():
+        count = f"{len(found['objects'])} of {len(found['objects']) + len(found['failed'])}"
+        mean, full = found["mean"], found["of_full"]
+        cells = []
+        if mean is not None:
+            cells = [f"{mean[k]:.{digits}f}\n{mean[k] - full[k]:+.{digits}f}" for _, k, digits in GEOMETRY_COLUMNS]
+        table.add_row(name.replace("_", " "), count, *cells)
+    return table
+
+
+def _geometry_cells(scores: Mapping[str, Any]) -> list[str]:
+    return [_numbers([scores[key]], digits)[0] for _, key, digits in GEOMETRY_COLUMNS]
+
+
 def _numbers(values: Sequence[float | None], digits: int) -> list[str]:
     return ["-" if value is None else f"{value:.{digits}f}" for value in values]

@@ -1,6 +1,7 @@
 """The two radiance fields of UniSDF, the bottleneck they share, and AffineGLO on it."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -28,6 +29,8 @@ class AppearanceConfig:
     """Length of a latent code; 0 leaves AffineGLO out."""
     latent_hidden_width: int = 32
     """Width of AffineGLO's hidden layer."""
+    radiance: Literal["blended", "camera", "reflected"] = "blended"
+    """UniSDF's two radiance fields and their blend (supplement A.1), or one of the two alone, for comparison."""
 
 
 class AffineGLO(nn.Module):
@@ -68,10 +71,11 @@ class AppearanceField(nn.Module):
             nn.ReLU(),
             nn.Linear(config.hidden_width, config.bottleneck_width),
         )
-        self.blend = nn.Linear(config.bottleneck_width, 1)
+        is_blended = config.radiance == "blended"
+        self.blend = nn.Linear(config.bottleneck_width, 1) if is_blended else None
         width = 3 + encoded_width(config.num_direction_octaves) + 3 + config.bottleneck_width
-        self.camera_radiance = _radiance_mlp(width, config)
-        self.reflected_radiance = _radiance_mlp(width, config)
+        self.camera_radiance = None if config.radiance == "reflected" else _radiance_mlp(width, config)
+        self.reflected_radiance = None if config.radiance == "camera" else _radiance_mlp(width, config)
         self.glo = None
         if config.latent_width:
             self.glo = AffineGLO(config.latent_width, config.latent_hidden_width, config.bottleneck_width)
@@ -84,16 +88,22 @@ class AppearanceField(nn.Module):
         latents: Float[Tensor, "points latent"] | None = None,
         level_weights: Float[Tensor, " levels"] | None = None,
     ) -> Float[Tensor, "points 7"]:
-        """Camera-view sRGB, reflected sRGB, raw blend weight. `latents` None stands for the zero code."""
+        """Camera-view sRGB, reflected sRGB, raw blend weight; of one radiance field alone, it twice and 0. `latents`
+        None stands for the zero code."""
         bottleneck = self.bottleneck(self.grid(positions, level_weights))
         if latents is not None and self.glo is not None:
             bottleneck = self.glo(bottleneck, latents)
         octaves = self.config.num_direction_octaves
-        mirrored = encode_directions(reflect(directions, normals), octaves)
-        seen = encode_directions(directions, octaves)
-        camera = self.camera_radiance(torch.cat([positions, seen, normals, bottleneck], -1))
-        reflected = self.reflected_radiance(torch.cat([positions, mirrored, normals, bottleneck], -1))
-        return torch.cat([torch.sigmoid(camera), torch.sigmoid(reflected), self.blend(bottleneck)], -1)
+        radiance = []
+        if self.camera_radiance is not None:
+            seen = encode_directions(directions, octaves)
+            radiance.append(torch.sigmoid(self.camera_radiance(torch.cat([positions, seen, normals, bottleneck], -1))))
+        if self.reflected_radiance is not None:
+            mirrored = encode_directions(reflect(directions, normals), octaves)
+            features = torch.cat([positions, mirrored, normals, bottleneck], -1)
+            radiance.append(torch.sigmoid(self.reflected_radiance(features)))
+        raw = torch.zeros_like(bottleneck[:, :1]) if self.blend is None else self.blend(bottleneck)
+        return torch.cat([radiance[0], radiance[-1], raw], -1)
 
 
 def blend_radiance(rendered: Float[Tensor, "rays 7"]) -> Float[Tensor, "rays 3"]:

@@ -36,7 +36,10 @@ class GeometryLossConfig:
     first_levels: int = 4
     """Hash levels that are on from the start."""
     coarse_to_fine_share: float = 0.5
-    """Share of the fit after which all levels are on."""
+    """Share of the fit after which all levels are on; 0: from the second step on, for comparison."""
+    starts_from_hull: bool = True
+    """The signed distance starts as that of the visual hull (see `start_from_cells`), or as UniSDF's sphere (supplement
+    A.1), for comparison."""
 
 
 def geometry_loss(
@@ -62,7 +65,7 @@ def geometry_loss(
     phase = progress / max(config.coarse_to_fine_share, 1e-6)
     grids = field.config.surface
     levels = coarse_to_fine_weights(grids.grid.num_levels, phase, config.first_levels, device)
-    normal_levels = coarse_to_fine_weights(grids.normal_grid.num_levels, phase, config.first_levels, device)
+    normal_levels = coarse_to_fine_weights(field.surface.num_normal_levels, phase, config.first_levels, device)
 
     samples = field.sample(origins, directions, near, far, generator, levels)
     points = field.worth_shading(samples)

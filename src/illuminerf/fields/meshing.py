@@ -14,6 +14,10 @@ from illuminerf.workflow.errors import UserError
 _CHUNK = 1 << 17
 
 
+class EmptySurface(UserError):
+    """The fit ended without a surface."""
+
+
 @torch.no_grad()
 def extract_mesh(
     surface: SurfaceField,
@@ -32,7 +36,7 @@ def extract_mesh(
         observed: components without a vertex in these cells are dropped too.
 
     Raises:
-        UserError: the distance has no zero crossing.
+        EmptySurface: the distance has no zero crossing.
     """
     side = cells.cells.shape[0]
     device = cells.cells.device
@@ -50,7 +54,7 @@ def extract_mesh(
         distance[chunk[inside]] = surface.signed_distance(positions[inside])
     volume = distance.view(shape).cpu().numpy()
     if volume.min() >= 0 or volume.max() <= 0:
-        raise UserError(
+        raise EmptySurface(
             "the fitted surface is empty: its signed distance has no zero crossing",
             fix="check masks and cameras, or fit for more steps",
         )

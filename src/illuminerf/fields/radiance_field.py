@@ -34,6 +34,8 @@ class FieldConfig:
     """Samples of smaller rendering weight are not shaded; 0 shades all."""
     radiance_normals: Literal["predicted", "density"] = "predicted"
     """Which normals the radiance fields see and reflect about."""
+    has_proposal: bool = True
+    """False: no proposal round (supplement A.1), surface samples are spaced evenly, for comparison."""
 
     def __post_init__(self) -> None:
         if min(self.num_proposal_samples, self.num_samples) < 2:
@@ -104,7 +106,7 @@ class RadianceField(nn.Module):
     def __init__(self, config: FieldConfig) -> None:
         super().__init__()
         self.config = config
-        self.proposal = ProposalField(config.proposal)
+        self.proposal = ProposalField(config.proposal) if config.has_proposal else None
         self.surface = SurfaceField(config.surface)
         self.appearance = AppearanceField(config.appearance)
 
@@ -122,24 +124,28 @@ class RadianceField(nn.Module):
         Args:
             generator: adds jitter; None is deterministic.
         """
-        coarse = uniform_edges(near, far, self.config.num_proposal_samples, generator)
-        density = self.proposal(_middles(origins, directions, coarse).view(-1, 3)).view(len(near), -1)
-        proposal_weights = rendering_weights(density * (coarse[:, 1:] - coarse[:, :-1]))
-        edges = resample_edges(coarse, proposal_weights, self.config.num_samples, generator)
+        if self.proposal is None:
+            coarse = edges = uniform_edges(near, far, self.config.num_samples, generator)
+            proposal_weights = None
+        else:
+            coarse = uniform_edges(near, far, self.config.num_proposal_samples, generator)
+            density = self.proposal(_middles(origins, directions, coarse).view(-1, 3)).view(len(near), -1)
+            proposal_weights = rendering_weights(density * (coarse[:, 1:] - coarse[:, :-1]))
+            edges = resample_edges(coarse, proposal_weights, self.config.num_samples, generator)
         ends = origins[:, None] + edges[..., None] * directions[:, None]
         point = self.surface(ends.view(-1, 3), level_weights)
         distance, end_gradients = point.signed_distance.view_as(edges), point.gradient.view_as(ends)
         depths = self.surface.depths_along(distance, edges)
-        share = _crossing(distance)[..., None]
+        share, weights = _crossing(distance)[..., None], rendering_weights(depths)
         return RaySamples(
             edges,
             torch.lerp(ends[:, :-1], ends[:, 1:], share),
-            rendering_weights(depths),
+            weights,
             depths.sum(-1),
             torch.lerp(end_gradients[:, :-1], end_gradients[:, 1:], share),
             end_gradients,
             coarse,
-            proposal_weights,
+            weights.detach() if proposal_weights is None else proposal_weights,  # the proposal's loss is then 0
         )
 
     def worth_shading(self, samples: RaySamples) -> ShadingPoints:

@@ -33,6 +33,9 @@ class SurfaceConfig:
     """The signed distance starts as a sphere of this radius."""
     initial_beta: float = 0.03
     """First value of VolSDF's beta, which is learned."""
+    has_normal_grid: bool = True
+    """False: predicted normals come from the signed distance's own features, as in UniSDF before the supplement's
+    change, for comparison."""
 
     def __post_init__(self) -> None:
         if not 0 < self.initial_radius < 1 or self.initial_beta <= 0:
@@ -57,12 +60,19 @@ class SurfaceField(nn.Module):
         self.head = nn.Linear(config.hidden_width, 1)
         nn.init.zeros_(self.head.bias)
         self.log_beta = nn.Parameter(torch.tensor(float(config.initial_beta)).log())
-        self.normal_grid = HashGrid(config.normal_grid)
+        self.normal_grid = HashGrid(config.normal_grid) if config.has_normal_grid else None
         self.normal_mlp = nn.Sequential(
-            nn.Linear(config.normal_grid.width, config.normal_hidden_width),
+            nn.Linear(
+                (config.normal_grid if config.has_normal_grid else config.grid).width, config.normal_hidden_width
+            ),
             nn.ReLU(),
             nn.Linear(config.normal_hidden_width, 3),
         )
+
+    @property
+    def num_normal_levels(self) -> int:
+        """Levels of the hash grid that predicted normals come from."""
+        return (self.normal_grid or self.grid).config.num_levels
 
     @property
     def beta(self) -> Float[Tensor, ""]:
@@ -108,7 +118,7 @@ class SurfaceField(nn.Module):
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> Float[Tensor, "points 3"]:
         """Unit normals from their own hash grid; they point away from the origin before training."""
-        raw = self.normal_mlp(self.normal_grid(positions, level_weights))
+        raw = self.normal_mlp((self.normal_grid or self.grid)(positions, level_weights))
         return functional.normalize(raw + positions, dim=-1, eps=1e-6)
 
     def depths_along(

@@ -136,7 +136,8 @@ def _fit(
         return geometry_loss(radiance_field, config.losses, pool, srgb, alpha, index, progress, generator)
 
     def start() -> None:
-        start_from_cells(radiance_field, hull, config.losses.first_levels, config.seed)
+        if config.losses.starts_from_hull:
+            start_from_cells(radiance_field, hull, config.losses.first_levels, config.seed)
 
     fit(radiance_field, config.optimiser, step_loss, checkpoint, "fit geometry", start)
 
