@@ -140,8 +140,8 @@ def customised(
     preset = PRESETS[name]
     capture: dict[str, Any] = {} if size is None else {"size": size}
     if background is not None:
-        if background not in ("white", "black", "none"):
-            raise UserError("unknown background", got=repr(background), wanted="white, black or none")
+        if background not in ("white", "black", "plain", "none"):
+            raise UserError("unknown background", got=repr(background), wanted="plain, white, black or none")
         capture["background"] = background
     drawn: dict[str, Any] = {} if samples is None else {"num_samples": samples}
     common = {"seed": seed, "device": device}

@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from illuminerf.data.decoding import read_straight
 from illuminerf.data.distortion import undistorted_image
+from illuminerf.data.plain_background import Backdrop, cut_out
 from illuminerf.data.resampling import area_downsampled, padded, padding_to
 from illuminerf.data.source import SourceCapture, SourceFrame
 from illuminerf.scene.cameras import Cameras
@@ -19,6 +20,7 @@ from illuminerf.scene.images import linear_from_srgb, srgb_from_linear, to_uint8
 from illuminerf.workflow.errors import UserError
 
 PlainBackground = Literal["white", "black"]
+"""Known beforehand; `plain_background.Backdrop` is one that was found."""
 PLAIN_BACKGROUND_TOLERANCE = 8 / 255
 """A pixel this close to white (or black) in every channel can be background; JPEG noise stays below."""
 
@@ -74,7 +76,7 @@ def plain_background_mask(srgb: np.ndarray, background: PlainBackground) -> np.n
 
 
 def develop(
-    frame: SourceFrame, size: tuple[int, int], common: tuple[int, int], background: PlainBackground | None
+    frame: SourceFrame, size: tuple[int, int], common: tuple[int, int], background: PlainBackground | Backdrop | None
 ) -> np.ndarray:
     """uint8 [height, width, 4], straight sRGB, undistorted, of the `common` size (width, height).
 
@@ -90,7 +92,11 @@ def develop(
     if frame.mask is not None:
         alpha = alpha * _read_mask(frame)
     elif background is not None and alpha.min() == 1.0:
-        alpha = alpha * plain_background_mask(srgb, background)
+        if isinstance(background, Backdrop):
+            straight = cut_out(srgb, background, frame.name)
+            srgb, alpha = straight[..., :3], straight[..., 3]
+        else:
+            alpha = alpha * plain_background_mask(srgb, background)
     if alpha.max() < 0.5:
         raise UserError(
             "a view shows nothing of the object",

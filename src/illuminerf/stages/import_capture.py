@@ -15,6 +15,7 @@ import numpy as np
 from illuminerf.data.capture import Background, write_capture
 from illuminerf.data.developing import PlainBackground, develop, plan_sizes, planned_cameras
 from illuminerf.data.placement import Ball, focus_ball, hull_ball, mask_preview
+from illuminerf.data.plain_background import Backdrop, find_backdrop
 from illuminerf.data.reading import CaptureFormat, read_source
 from illuminerf.data.source import SourceCapture
 from illuminerf.scene.cameras import Cameras
@@ -42,9 +43,9 @@ class Config:
     """Which list of frames is read, where the folder has several."""
     mask_folder: str = "masks"
     """Folder beside the images with one mask per image, white on the object."""
-    background: PlainBackground | Literal["none"] = "none"
+    background: PlainBackground | Literal["none", "plain"] = "none"
     """Plain colour behind the object in images without alpha and masks: it is cut out from the border
-    inward.
+    inward. "plain" is any even colour, found from the images' borders, and leaves soft outlines.
     """
     placement: Literal["auto", "masks", "cameras", "keep"] = "auto"
     """What the unit ball is found from: the masks' visual hull, the cameras alone, or "keep" the caller's
@@ -79,8 +80,8 @@ def run(source: Path, config: Config, out: Path) -> Path:
     background: Background = "opaque" if _is_opaque(images, plan.per_frame) else "masked"
     if background == "opaque":
         say(
-            "no masks: every pixel counts as object (alpha = 1). For an object on a plain background set "
-            "background white or black; otherwise add masks/."
+            "no masks: every pixel counts as object (alpha = 1). For an object on a plain background of any colour set "
+            f"background plain; otherwise add masks/.{_looks_plain(found)}"
         )
     scale, offset = _place(cameras, previews, background, config)
     with open_artefact(out, "import_capture", config, inputs) as artefact:
@@ -104,11 +105,23 @@ def _developed(
     found: SourceCapture, sizes: tuple[tuple[int, int], ...], common: tuple[int, int], config: Config
 ) -> list[np.ndarray]:
     """uint8 [height, width, 4] per view: straight sRGB."""
-    background = None if config.background == "none" else config.background
+    background: PlainBackground | Backdrop | None = None
+    if config.background == "plain":
+        background = find_backdrop(found.frames)
+    elif config.background != "none":
+        background = config.background
     # Decoding leaves the interpreter's lock, so threads are enough; the order stays that of the frames.
     with ThreadPoolExecutor(min(MAX_THREADS, os.cpu_count() or 1)) as pool:
         images = pool.map(lambda frame, size: develop(frame, size, common, background), found.frames, sizes)
         return list(track(images, "read images", total=len(found.frames)))
+
+
+def _looks_plain(found: SourceCapture) -> str:
+    try:
+        backdrop = find_backdrop(found.frames)
+    except UserError:
+        return ""
+    return "" if backdrop is None else " This one looks plain."
 
 
 def _is_opaque(images: list[np.ndarray], sizes: tuple[tuple[int, int], ...]) -> bool:
