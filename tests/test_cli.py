@@ -79,6 +79,13 @@ def test_impossible_lights_are_found_before_any_work(
     assert not (tmp_path / "run").exists()
 
 
+def test_a_missing_mesh_is_found_before_any_work(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "mine.ply is missing" in refused(relight(capture, tmp_path, "--mesh", str(tmp_path / "mine.ply")), capsys)
+    assert not (tmp_path / "run").exists()
+
+
 def test_unknown_preset(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     message = refused(relight(capture, tmp_path, "--preset", "supreme"), capsys)
     assert "supreme" in message and "embedded" in message
@@ -108,6 +115,7 @@ def test_benchmark_asks_for_what_it_needs(tmp_path: Path, capsys: pytest.Capture
         ["--help"],
         ["benchmark", "tensoir", "--help"],
         ["benchmark", "ablation", "--help"],
+        ["benchmark", "geometry", "--help"],
         ["benchmark", "stanford-orb", "--help"],
         ["benchmark", "stanford-orb-illumination", "--help"],
         ["data", "synthetic-orb", "--help"],

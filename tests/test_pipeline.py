@@ -10,12 +10,16 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from illuminerf import demo, pipeline
+from illuminerf.data.capture import load_capture
 from illuminerf.evaluation.benchmark_rule import score_light, view_pair
+from illuminerf.fields.mesh_fit import SurfaceRegressionConfig
 from illuminerf.presets import PRESETS, Preset, customised
 from illuminerf.scene.images import read_png
+from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.stages import fit_latent_nerf, render_novel_views
 from illuminerf.workflow.artefact import fingerprint
 from illuminerf.workflow.atomic import read_json, write_json
@@ -135,3 +139,30 @@ def test_scores_file_of_the_demo_has_the_documented_keys(tmp_path: Path) -> None
     scores = demo.run(tmp_path / "demo", tiny())
     written = json.loads((tmp_path / "demo" / "scores.json").read_text())
     assert set(written) == {"psnr", "ssim", "input_light_psnr", "seconds", "peak_memory_gb"} == set(scores)
+
+
+def test_a_mesh_takes_the_place_of_the_estimate(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The estimated mesh, as someone else's: cues and field are made from it, and the rest follows."""
+    capture, mesh = load_capture(finished / "capture"), TriangleMesh.load_glb(finished / "geometry" / "mesh.glb")
+    vertices = (mesh.vertices / capture.scale - capture.offset).astype(np.float32)
+    TriangleMesh(vertices, mesh.faces, mesh.vertex_normals).save_glb(tmp_path / "mine.glb")
+    settings = dataclasses.replace(
+        pipeline.mesh_settings(tiny()),
+        regression=SurfaceRegressionConfig(num_steps=4, points_per_step=256),
+        spacing=0.04,
+        ray_size=32,
+        occupancy_side=24,
+    )
+    assert settings.radiance_field == tiny().geometry.radiance_field and settings.optimiser.num_steps == 12 // 5
+    monkeypatch.setattr(pipeline, "mesh_settings", lambda _: settings)
+    photographs, out = few_photographs(tmp_path), tmp_path / "run"
+    with pytest.raises(UserError, match="is missing"):
+        pipeline.relight(photographs, [pipeline.LightJob(LIGHT)], tiny(), out, tmp_path / "absent.glb")
+    assert not out.exists()
+    pipeline.relight(photographs, [pipeline.LightJob(LIGHT)], tiny(), out, tmp_path / "mine.glb")
+    np.testing.assert_allclose(TriangleMesh.load_glb(out / "mesh.glb").vertices, mesh.vertices, atol=1e-5)
+    assert (out / "report.html").is_file() and (out / "turntable.mp4").is_file()
+    for stage in ("geometry", "lights/evening/latent_nerf"):
+        assert fingerprint(out / stage) != fingerprint(finished / stage)

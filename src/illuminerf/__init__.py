@@ -24,6 +24,7 @@ def relight(
     size: int | None = None,
     seed: int = 0,
     device: str = "auto",
+    mesh: str | Path | None = None,
 ) -> Path:
     """Relight a capture under each of `lights`: what `illuminerf relight` does.
 
@@ -36,6 +37,7 @@ def relight(
         size: longest side of the photographs in pixels.
         seed: of every random stream.
         device: "auto", "cpu" or "cuda".
+        mesh: a mesh in the capture's world that takes the place of estimated geometry.
 
     Returns:
         `out`, with report.html, turntable.mp4, mesh.glb and, per light, the artefacts of every stage.
@@ -47,5 +49,5 @@ def relight(
 
     settings = presets.customised(preset, samples=samples, size=size, seed=seed, device=device)
     jobs = [pipeline.LightJob(Path(light)) for light in lights]
-    pipeline.relight(Path(photos), jobs, settings, Path(out))
+    pipeline.relight(Path(photos), jobs, settings, Path(out), None if mesh is None else Path(mesh))
     return Path(out)

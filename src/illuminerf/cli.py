@@ -38,6 +38,7 @@ from illuminerf.stages import (
     render_radiance_cues,
     render_training_pairs,
     train_relighting_model,
+    use_mesh,
 )
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say
@@ -61,6 +62,7 @@ def relight_command(
     exposure: float = 0.0,
     background: str | None = None,
     model: str | None = None,
+    mesh: Path | None = None,
 ) -> None:
     """Relight a capture: every stage of the method, from photographs to turntable, mesh and report.
 
@@ -77,12 +79,13 @@ def relight_command(
         exposure: Stops by which the light is made brighter.
         background: Background to cut away where the photographs have no masks: plain (any even colour), white or black.
         model: Another relighting model than the preset's: a folder, embedded or dilightnet.
+        mesh: A .glb, .obj or .ply mesh in the capture's world that takes the place of estimated geometry.
     """
     settings = customised(
         preset, samples=samples, size=size, seed=seed, device=device, rotate_degrees=rotate, exposure_stops=exposure,
         background=background, model=model,
     )  # fmt: skip
-    pipeline.relight(capture, [pipeline.LightJob(path) for path in light], settings, out)
+    pipeline.relight(capture, [pipeline.LightJob(path) for path in light], settings, out, mesh)
     say(f"done: {out / 'report.html'}, {out / 'turntable.mp4'}, {out / 'mesh.glb'}")
 
 
@@ -215,6 +218,12 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     ),
     "estimate-geometry": _stage(
         estimate_geometry.run, estimate_geometry.Config, "Fit the surface field to a capture.", {"capture": Path}
+    ),
+    "use-mesh": _stage(
+        use_mesh.run,
+        use_mesh.Config,
+        "Take a mesh in the capture's world for its geometry, in place of estimate-geometry.",
+        {"mesh": Path, "capture": Path},
     ),
     "estimate-illumination": _stage(
         estimate_illumination.run,

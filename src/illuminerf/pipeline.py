@@ -13,7 +13,7 @@ what was made with other settings. Started again after a kill, this page continu
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from illuminerf.report import write_report
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import read_png
+from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.scene.video import write_mp4
 from illuminerf.stages import (
     estimate_geometry,
@@ -35,6 +36,7 @@ from illuminerf.stages import (
     relight_views,
     render_novel_views,
     render_radiance_cues,
+    use_mesh,
 )
 from illuminerf.workflow.artefact import read_metrics
 from illuminerf.workflow.atomic import atomic_path, read_json, write_json
@@ -60,8 +62,10 @@ class LightJob:
         return self.light.stem
 
 
-def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -> dict[str, Any]:
-    """Relight the capture in `source` under every light of `jobs`; geometry is estimated once.
+def relight(
+    source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path, mesh: Path | None = None
+) -> dict[str, Any]:
+    """Relight the capture in `source` under every light of `jobs`; geometry is estimated once, or is that of `mesh`.
 
     Returns:
         By light, its scores where there is truth ({"psnr": ..., "ssim": ...}).
@@ -71,7 +75,9 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
     """
     _check(jobs)
     check_model(preset.relighting_model)
-    shared = estimate_object(source, preset, out)
+    if mesh is not None:
+        TriangleMesh.load(mesh)  # find a bad one before anything is written
+    shared = estimate_object(source, preset, out, mesh)
     capture, geometry, illumination = shared["capture"], shared["geometry"], shared.get("illumination")
     _copy(geometry / "mesh.glb", out / "mesh.glb")
     lights: dict[str, dict[str, Path]] = {}
@@ -96,15 +102,34 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
     return scores
 
 
-def estimate_object(source: Path, preset: Preset, out: Path) -> dict[str, Path]:
+def estimate_object(source: Path, preset: Preset, out: Path, mesh: Path | None = None) -> dict[str, Path]:
     """The half of the method that no target light changes: capture, geometry and, where the preset has it, the
-    photographs' own illumination."""
+    photographs' own illumination. A mesh in the world of `source` takes the place of the estimated geometry."""
     capture = import_capture.run(source, preset.capture, out / "capture")
-    geometry = estimate_geometry.run(capture, preset.geometry, out / "geometry")
+    if mesh is None:
+        geometry = estimate_geometry.run(capture, preset.geometry, out / "geometry")
+    else:
+        geometry = use_mesh.run(mesh, capture, mesh_settings(preset), out / "geometry")
     shared = {"capture": capture, "geometry": geometry}
     if preset.illumination is not None:
         shared["illumination"] = estimate_illumination.run(geometry, capture, preset.illumination, out / "illumination")
     return shared
+
+
+def mesh_settings(preset: Preset) -> use_mesh.Config:
+    """How a mesh is used in place of the preset's geometry: a field of the same sizes, fitted for a fifth of the steps,
+    since the surface is known."""
+    of_preset = preset.geometry
+    steps = max(1, of_preset.optimiser.num_steps // 5)
+    optimiser = replace(of_preset.optimiser, num_steps=steps, warmup_steps=of_preset.optimiser.warmup_steps // 5)
+    return use_mesh.Config(
+        radiance_field=of_preset.radiance_field,
+        optimiser=optimiser,
+        occupancy_side=of_preset.occupancy_side,
+        num_previews=of_preset.num_previews,
+        seed=of_preset.seed,
+        device=of_preset.device,
+    )
 
 
 def relight_under(

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -12,6 +13,7 @@ from illuminerf.workflow.errors import UserError
 
 # glTF is y-up: (x, y, z) of our z-up world is written as (x, z, -y)
 GLTF_FROM_WORLD = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
+UpAxis = Literal["auto", "y", "z"]
 
 
 @dataclass(frozen=True)
@@ -59,27 +61,50 @@ class TriangleMesh:
         Raises:
             UserError: missing, unreadable or empty.
         """
-        if not Path(path).is_file():
-            raise UserError(f"{path} is missing", wanted="a .glb mesh")
-        try:
-            scene = trimesh.load_scene(str(path), file_type="glb", process=False)
-            placed = [_placed(scene, node) for node in scene.graph.nodes_geometry]
-        except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
-            raise UserError(f"{path} is not a readable GLB mesh", got=str(error), fix="export it again") from error
-        parts = [part for part in placed if part is not None]
-        if not parts:
-            raise UserError(f"{path} holds no triangles")
-        firsts: np.ndarray = np.cumsum(np.array([0, *(len(vertices) for vertices, _, _ in parts[:-1])]))
-        return TriangleMesh(
-            np.concatenate([vertices for vertices, _, _ in parts]),
-            np.concatenate([faces + first for (_, faces, _), first in zip(parts, firsts, strict=True)]).astype(
-                np.int32
-            ),
-            np.concatenate([normals for _, _, normals in parts]),
-        )
+        return _loaded(path, "glb", GLTF_FROM_WORLD)
+
+    @staticmethod
+    def load(path: Path, up_axis: UpAxis = "auto") -> "TriangleMesh":
+        """Read a .glb, .gltf, .obj or .ply file as one mesh; normals that it lacks are averaged over faces.
+
+        Args:
+            path: the file.
+            up_axis: of the file; "y" is turned to our z-up axes. "auto": y for glTF, z for the others.
+
+        Raises:
+            UserError: missing, of another kind, unreadable or empty.
+        """
+        suffix = Path(path).suffix.lower().removeprefix(".")
+        if suffix not in ("glb", "gltf", "obj", "ply"):
+            raise UserError("not a mesh file", got=str(path), wanted=".glb, .gltf, .obj or .ply")
+        is_y_up = up_axis == "y" or (up_axis == "auto" and suffix in ("glb", "gltf"))
+        return _loaded(path, suffix, GLTF_FROM_WORLD if is_y_up else np.eye(3, dtype=np.float32))
 
 
-def _placed(scene: trimesh.Scene, node: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _loaded(path: Path, kind: str, file_from_world: np.ndarray) -> TriangleMesh:
+    if not Path(path).is_file():
+        raise UserError(f"{path} is missing", wanted=f"a .{kind} mesh")
+    try:
+        scene = trimesh.load_scene(str(path), file_type=kind, process=False)
+        placed = [_placed(scene, node, file_from_world) for node in scene.graph.nodes_geometry]
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} is not a readable {kind.upper()} mesh", got=str(error), fix="export it again"
+        ) from error
+    parts = [part for part in placed if part is not None]
+    if not parts:
+        raise UserError(f"{path} holds no triangles")
+    firsts: np.ndarray = np.cumsum(np.array([0, *(len(vertices) for vertices, _, _ in parts[:-1])]))
+    return TriangleMesh(
+        np.concatenate([vertices for vertices, _, _ in parts]),
+        np.concatenate([faces + first for (_, faces, _), first in zip(parts, firsts, strict=True)]).astype(np.int32),
+        np.concatenate([normals for _, _, normals in parts]),
+    )
+
+
+def _placed(
+    scene: trimesh.Scene, node: str, file_from_world: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Vertices, faces and normals of one node in our world, or None where it has no triangles."""
     transform, name = scene.graph[node]
     mesh = scene.geometry[name]
@@ -89,7 +114,7 @@ def _placed(scene: trimesh.Scene, node: str) -> tuple[np.ndarray, np.ndarray, np
     vertices = mesh.vertices @ transform[:3, :3].T + transform[:3, 3]
     normals = mesh.vertex_normals @ normal_transform.T
     normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    turned = [np.ascontiguousarray(array @ GLTF_FROM_WORLD, np.float32) for array in (vertices, normals)]
+    turned = [np.ascontiguousarray(array @ file_from_world, np.float32) for array in (vertices, normals)]
     return turned[0], np.asarray(mesh.faces, np.int64), turned[1]
 
 

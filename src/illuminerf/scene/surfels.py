@@ -39,19 +39,23 @@ class Surfels:
         distance, index = self._tree.query(points, k=range(1, count + 1))
         return np.asarray(distance), np.asarray(index)
 
-    def nearest(self, points: np.ndarray) -> np.ndarray:
-        """Index [points] of the disc with the nearest centre."""
-        return np.asarray(self._tree.query(points)[1])
+    def nearest(self, points: np.ndarray, within: float = np.inf) -> np.ndarray:
+        """Index [points] of the disc with the nearest centre; -1 where none is `within` reach, which is found fast."""
+        distance, index = self._tree.query(points, distance_upper_bound=within)
+        return np.where(np.isfinite(distance), index, -1)
 
     def distances(self, points: np.ndarray) -> np.ndarray:
         """Distance [points] to the disc with the nearest centre; infinite where there are no discs."""
         if not len(self):
             return np.full(len(points), np.inf)
-        index = self.nearest(points)
+        return np.abs(self.signed_distances(points, self.nearest(points)))
+
+    def signed_distances(self, points: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Distance [points] of each point to the disc that `index` [points] names, negative behind it."""
         offset = points.astype(np.float64) - self.positions[index]
         across = (offset * self.normals[index]).sum(-1)
         along = np.linalg.norm(offset - across[:, None] * self.normals[index], axis=-1)
-        return np.hypot(across, np.maximum(along - self.radius, 0))
+        return np.copysign(np.hypot(across, np.maximum(along - self.radius, 0)), across)
 
 
 def thinned(positions: np.ndarray, normals: np.ndarray, spacing: float) -> np.ndarray:
