@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import tyro
-from rich.table import Table
 
 from illuminerf import pipeline
 from illuminerf.cues.broken_object import BrokenObject
@@ -35,7 +34,6 @@ from illuminerf.workflow.device import derived_seed
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import console, say
 
-_LOG_WIDTH = 150
 _SYMMETRIC = (1e-3, 1e-3, 1e-3)
 
 Ablation = Callable[[estimate_geometry.Config], estimate_geometry.Config]
@@ -135,9 +133,9 @@ def geometry_command(
     result = run(chosen, light_files(lights), settings, out)
     if json is not None:
         write_json(json, result)
-    _print(geometry_table(result["objects"], result["mean"]))
+    console.print(geometry_table(result["objects"], result["mean"]))
     if ablations:
-        _print(geometry_ablation_table(result["ablations"]))
+        console.print(geometry_ablation_table(result["ablations"]))
     say(f"done: {out / 'scores.json'}, {out}/<object>/scores/sheet.png")
 
 
@@ -257,11 +255,6 @@ def score_estimate(source: Path, capture: Path, settings: Settings, out: Path) -
     views = render_novel_views.run(geometry, cameras, preset.test_views, out / "test_views")
     scored = score_geometry.run(source, capture, geometry, views, settings.scores, out / "scores")
     return {**read_json(scored / "scores.json"), "seconds": read_metrics(geometry)["seconds"]}
-
-
-def _print(table: Table) -> None:
-    """Wide as it is where lines are not a terminal's."""
-    console.print(table, width=None if console.is_terminal else _LOG_WIDTH)
 
 
 def mean_scores(scores: Sequence[dict[str, Any]]) -> dict[str, float]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from illuminerf.evaluation.published import TENSOIR, GalleryScores, gallery_scores
@@ -97,50 +98,57 @@ def ablation_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 GEOMETRY_COLUMNS = (
-    ("normals, deg", "normal_degrees", 2),
-    ("median", "normal_median_degrees", 2),
-    ("gradient", "gradient_normal_degrees", 2),
-    ("faces", "face_normal_degrees", 2),
-    ("Chamfer, %", "chamfer_percent", 3),
-    ("F 0.5%", "f_score_half_percent", 3),
-    ("F 1%", "f_score_1_percent", 3),
-    ("mask IoU", "mask_iou", 4),
+    ("normal", "normal_degrees", 2),
+    ("SDF", "gradient_normal_degrees", 2),
+    ("face", "face_normal_degrees", 2),
+    ("Chamf", "chamfer_percent", 3),
+    ("F0.5", "f_score_half_percent", 3),
+    ("F1", "f_score_1_percent", 3),
+    ("IoU", "mask_iou", 3),
     ("PSNR", "psnr", 2),
-    ("floaters", "floater_share", 4),
-    ("fit s", "fit_seconds", 0),
+    ("float", "floater_share", 3),
+    ("s", "fit_seconds", 0),
 )
-"""Heading, key in scores.json, digits."""
+"""Heading, key in scores.json, digits; together they fit a terminal."""
+_NOT_OF_ABLATIONS = ("face_normal_degrees", "f_score_half_percent", "floater_share")
+_GEOMETRY_CAPTION = (
+    "degrees between true normals and predicted ones, those of the signed distance, of the faces; Chamfer distance in "
+    "percent of the size; F-scores within 0.5 and 1 percent; IoU of masks; share of floaters; seconds of the fit"
+)
 
 
 def geometry_table(objects: Mapping[str, Mapping[str, Any]], mean: Mapping[str, float]) -> Table:
     """One row per object, and their mean."""
-    table = Table(title="Estimated geometry against the truth, in unseen views and over the surface that is seen")
-    for heading in ("object", "light"):
-        table.add_column(heading)
-    for heading, _, _ in GEOMETRY_COLUMNS:
-        table.add_column(heading, justify="right")
+    table = _empty_geometry_table("Estimated geometry against the truth", "object")
     for name, scores in objects.items():
-        table.add_row(name, scores["light"], *_geometry_cells(scores))
+        table.add_row(name, *_geometry_cells(scores))
     table.add_section()
-    table.add_row("mean", "", *_geometry_cells(mean))
+    table.add_row("mean", *_geometry_cells(mean))
     return table
 
 
 def geometry_ablation_table(ablations: Mapping[str, Mapping[str, Any]]) -> Table:
-    """One row per ablation: means over those objects that it and the full method reconstructed, and how far they are
-    from the full method's."""
-    table = Table(title="Geometry with one part of the method changed (second line: change against the full method)")
-    for heading in ("ablation", "objects"):
-        table.add_column(heading)
-    for heading, _, _ in GEOMETRY_COLUMNS:
-        table.add_column(heading, justify="right")
+    """One row per ablation: means over those objects that it and the full method reconstructed, and on a second line
+    how far they are from the full method's."""
+    title = "Geometry with one part of the method changed; below each number, its change"
+    columns = tuple(column for column in GEOMETRY_COLUMNS if column[1] not in _NOT_OF_ABLATIONS)
+    table = _empty_geometry_table(title, "ablation", columns)
     for name, found in ablations.items():
-        count = f"{len(found['objects'])} of {len(found['objects']) + len(found['failed'])}"
-        mean, full = found["mean"], found["of_full"]
+        mean, full, failed = found["mean"], found["of_full"], len(found["failed"])
         cells = []
         if mean is not None:
-            cells = [f"{mean[k]:.{digits}f}\n{mean[k] - full[k]:+.{digits}f}" for _, k, digits in GEOMETRY_COLUMNS]
-        table.add_row(name.replace("_", " "), count, *cells)
+            cells = [f"{mean[key]:.{digits}f}\n{mean[key] - full[key]:+.{digits}f}" for _, key, digits in columns]
+        table.add_row(name.replace("_", " ") + (f"\n{failed} without a surface" if failed else ""), *cells)
+    return table
+
+
+def _empty_geometry_table(
+    title: str, first: str, columns: tuple[tuple[str, str, int], ...] = GEOMETRY_COLUMNS
+) -> Table:
+    table = Table(title=title, caption=_GEOMETRY_CAPTION, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column(first, overflow="fold")
+    for heading, _, _ in columns:
+        table.add_column(heading, justify="right", no_wrap=True)
     return table
 
 
