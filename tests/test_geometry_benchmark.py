@@ -164,3 +164,11 @@ def test_objects_are_chosen_by_name_and_lights_by_the_objects_name(collection: P
     assert geometry_benchmark.light_files(collection) == [collection / "studio.exr"]
     with pytest.raises(UserError, match="no light"):
         geometry_benchmark.light_files(collection / "objects")
+
+
+def test_ablations_are_chosen_by_name() -> None:
+    assert geometry_benchmark.chosen_ablations(()) == ()
+    assert geometry_benchmark.chosen_ablations(["sphere_start"]) == ("sphere_start",)
+    assert geometry_benchmark.chosen_ablations(["all"]) == tuple(geometry_benchmark.ABLATIONS)
+    with pytest.raises(UserError, match="no such ablations; got cube_start"):
+        geometry_benchmark.chosen_ablations(["cube_start", "sphere_start"])

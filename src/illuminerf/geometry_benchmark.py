@@ -91,7 +91,7 @@ def geometry_command(
     all_around: bool = False,
     preset: str = "embedded",
     steps: int | None = None,
-    ablations: bool = False,
+    ablations: tuple[str, ...] = (),
     json: Path | None = None,
     seed: int = 0,
     device: str = "auto",
@@ -110,7 +110,8 @@ def geometry_command(
         all_around: Photograph from below too, not from the upper half of the sphere only.
         preset: Whose geometry settings are measured: see `illuminerf presets`.
         steps: Steps of the fit, where not the preset's.
-        ablations: Also fit every object with one part of the method changed at a time, and print what that does.
+        ablations: Also fit every object with these parts of the method changed, one at a time: names as in
+            docs/benchmarks.md, or all.
         json: Also write the scores here.
         seed: Of every random stream.
         device: auto, cpu or cuda.
@@ -128,7 +129,7 @@ def geometry_command(
         ),
         with_steps(customised(preset, size=size, seed=seed, device=device), steps),
         score_geometry.Config(seed=seed, device=device),
-        tuple(ABLATIONS) if ablations else (),
+        chosen_ablations(ablations),
     )
     result = run(chosen, light_files(lights), settings, out)
     if json is not None:
@@ -155,6 +156,18 @@ def chosen_objects(collection: Path, names: Sequence[str]) -> list[CollectionObj
             wanted=f"some of {shown}{', ...' if len(found) > 8 else ''}",
         )
     return [item for item in found if not names or {item.id, item.path.stem} & set(names)]
+
+
+def chosen_ablations(names: Sequence[str]) -> tuple[str, ...]:
+    """The ablations of these names; "all" stands for every one.
+
+    Raises:
+        UserError: there is no such ablation.
+    """
+    unknown = set(names) - {*ABLATIONS, "all"}
+    if unknown:
+        raise UserError("no such ablations", got=", ".join(sorted(unknown)), wanted=f"all, {', '.join(ABLATIONS)}")
+    return tuple(name for name in ABLATIONS if {name, "all"} & set(names))
 
 
 def light_files(lights: Path) -> list[Path]:

@@ -41,16 +41,16 @@ def test_normals_look_at_the_camera_however_faces_are_wound() -> None:
 
 def test_what_is_hidden_inside_is_not_seen() -> None:
     outer, inner = sphere_mesh(3, 0.6), sphere_mesh(3, 0.3)
-    seen = seen_surfels(concatenated([outer, inner]), CAMERAS, 0.05, 96)
+    seen, _ = seen_surfels(concatenated([outer, inner]), CAMERAS, 0.05, 96)
     radius = np.linalg.norm(seen.positions, axis=-1)
     assert radius.min() > 0.58 and len(seen) > 500
     assert ((seen.positions * seen.normals).sum(-1) > 0.55).all()
-    assert seen_surfels(inner, CAMERAS, 0.05, 96).positions.max() < 0.31  # the guard: alone it is
+    assert seen_surfels(inner, CAMERAS, 0.05, 96)[0].positions.max() < 0.31  # the guard: alone it is
 
 
 def test_only_the_side_that_a_camera_sees() -> None:
     camera = turntable_cameras(1, 3.0, 0.6, 64, 64, elevation_radians=0.0)
-    seen = seen_surfels(sphere_mesh(3, 0.6), camera, 0.05, 64)
+    seen, _ = seen_surfels(sphere_mesh(3, 0.6), camera, 0.05, 64)
     assert seen.positions[:, 0].min() > 0.05
     far = TriangleMesh(sphere_mesh(1).vertices + np.float32([9, 9, 9]), sphere_mesh(1).faces, sphere_mesh(1).vertices)
     with pytest.raises(UserError, match="no camera sees"):

@@ -7,7 +7,7 @@ import torch
 from illuminerf.fields.appearance import AppearanceConfig, AppearanceField, blend_radiance
 from illuminerf.fields.bounds import OccupiedCells
 from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss
-from illuminerf.fields.hash_grid import HashGridConfig, coarse_to_fine_weights
+from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.proposal_sampling import ProposalConfig, interlevel_loss
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
 from illuminerf.fields.ray_pool import gather_rays
@@ -101,11 +101,21 @@ def test_every_kind_can_be_fitted_stored_and_loaded(part: str, tmp_path) -> None
 
 
 def test_without_coarse_to_fine_all_levels_are_on_from_the_second_step() -> None:
-    def levels(share: float, step: int) -> list[float]:
-        return coarse_to_fine_weights(5, step / 100 / max(share, 1e-6), 2).tolist()
+    cameras = sphere_cameras(3, 2.5, 0.7, 8, 8, np.random.default_rng(0))
+    cells = OccupiedCells(torch.ones(8, 8, 8, dtype=torch.bool))
+    pool = gather_rays(cameras, np.ones((3, 8, 8), np.float32), cells)
+    target, index = torch.full((len(pool), 3), 0.5), torch.arange(16)
 
-    assert levels(0.0, 1) == [1] * 5
-    assert levels(0.5, 1) != [1] * 5 and levels(0.5, 50) == [1] * 5
+    def learns_finest_level(share: float, progress: float) -> bool:
+        field, generator = field_with("default"), torch.Generator().manual_seed(0)
+        config = GeometryLossConfig(first_levels=1, coarse_to_fine_share=share)
+        geometry_loss(field, config, pool, target, None, index, progress, generator)[0].backward()
+        grid = field.surface.grid
+        assert grid.table.grad is not None
+        return bool(grid.table.grad[int(grid.layout[-1, 2]) :].any())
+
+    assert learns_finest_level(0.0, 0.01) and learns_finest_level(0.5, 0.5)
+    assert not learns_finest_level(0.5, 0.01)  # the guard
 
 
 def test_appearance_without_a_blend_has_no_such_weights() -> None:

@@ -60,9 +60,10 @@ class MeshScene:
 
 
 def seen_surfels(
-    mesh: TriangleMesh, cameras: Cameras, spacing: float, size: int, device: str = "auto", is_smooth: bool = False
-) -> Surfels:
-    """The part of a mesh's surface that some camera sees, evenly sampled.
+    mesh: TriangleMesh, cameras: Cameras, spacing: float, size: int, device: str = "auto"
+) -> tuple[Surfels, np.ndarray]:
+    """The part of a mesh's surface that some camera sees, evenly sampled: discs along its faces, and the unit normals
+    [surfels, 3] interpolated between the vertices' there.
 
     Rays of all cameras are cast, so what is hidden inside a model does not count, nor do doubled faces.
 
@@ -72,12 +73,11 @@ def seen_surfels(
         spacing: between the points, in world units.
         size: rays along the longer side of every image.
         device: auto, cpu or cuda.
-        is_smooth: normals are interpolated between the vertices', not the faces'; the points are the same.
 
     Raises:
         UserError: no camera sees the mesh.
     """
-    scene = MeshScene(mesh, is_smooth, device)
+    scene = MeshScene(mesh, device=device)
     factor = size / max(cameras.height, cameras.width)
     cameras = cameras.resized(max(1, round(cameras.height * factor)), max(1, round(cameras.width * factor)))
     found = np.zeros((0, 9), np.float32)
@@ -86,4 +86,4 @@ def seen_surfels(
         found = found[thinned(found[:, :3], found[:, 6:], spacing)]
     if not len(found):
         raise UserError("no camera sees the mesh", fix="check that mesh and cameras are in the same world")
-    return Surfels(found[:, :3].copy(), found[:, 3:6].copy(), spacing)
+    return Surfels(found[:, :3].copy(), found[:, 6:].copy(), spacing), found[:, 3:6].copy()

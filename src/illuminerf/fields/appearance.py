@@ -94,16 +94,15 @@ class AppearanceField(nn.Module):
         if latents is not None and self.glo is not None:
             bottleneck = self.glo(bottleneck, latents)
         octaves = self.config.num_direction_octaves
+        mirrored = encode_directions(reflect(directions, normals), octaves)
         radiance = []
         if self.camera_radiance is not None:
             seen = encode_directions(directions, octaves)
-            radiance.append(torch.sigmoid(self.camera_radiance(torch.cat([positions, seen, normals, bottleneck], -1))))
+            radiance.append(self.camera_radiance(torch.cat([positions, seen, normals, bottleneck], -1)))
         if self.reflected_radiance is not None:
-            mirrored = encode_directions(reflect(directions, normals), octaves)
-            features = torch.cat([positions, mirrored, normals, bottleneck], -1)
-            radiance.append(torch.sigmoid(self.reflected_radiance(features)))
+            radiance.append(self.reflected_radiance(torch.cat([positions, mirrored, normals, bottleneck], -1)))
         raw = torch.zeros_like(bottleneck[:, :1]) if self.blend is None else self.blend(bottleneck)
-        return torch.cat([radiance[0], radiance[-1], raw], -1)
+        return torch.cat([torch.sigmoid(radiance[0]), torch.sigmoid(radiance[-1]), raw], -1)
 
 
 def blend_radiance(rendered: Float[Tensor, "rays 7"]) -> Float[Tensor, "rays 3"]:

@@ -136,7 +136,7 @@ def _distances(
     mesh: TriangleMesh, truth: TriangleMesh, photographed: Cameras, size: float, config: Config
 ) -> dict[str, Any]:
     spacing = config.spacing_percent / 100 * size
-    estimated, true = (seen_surfels(m, photographed, spacing, config.ray_size, config.device) for m in (mesh, truth))
+    estimated, true = (seen_surfels(m, photographed, spacing, config.ray_size, config.device)[0] for m in (mesh, truth))
     found = surface_distances(estimated, true, size)
     return {
         "chamfer_percent": found.chamfer,

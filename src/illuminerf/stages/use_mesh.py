@@ -158,8 +158,7 @@ def _checked_overlap(mesh: TriangleMesh, capture: Capture, config: Config) -> fl
 
 def _seen_from(mesh: TriangleMesh, cameras: Cameras, config: Config) -> tuple[MeshDistance, np.ndarray]:
     """The mesh's signed distance, and smooth normals at its points."""
-    seen = seen_surfels(mesh, cameras, config.spacing, config.ray_size, config.device)
-    smooth = seen_surfels(mesh, cameras, config.spacing, config.ray_size, config.device, is_smooth=True).normals
+    seen, smooth = seen_surfels(mesh, cameras, config.spacing, config.ray_size, config.device)
     scene = MeshScene(mesh, is_smooth=False, device=config.device)
     factor = config.ray_size / max(cameras.height, cameras.width)
     small = cameras.resized(max(1, round(cameras.height * factor)), max(1, round(cameras.width * factor)))
