@@ -130,7 +130,7 @@ def test_unlit_images_are_straight_and_need_no_shading() -> None:
     straight, alpha = torch.rand(1, 3, 8, 8), 0.1 + 0.9 * torch.rand(1, 1, 8, 8)
     image = torch.cat([straight * alpha, alpha], 1)
     unknown = unlit(image, torch.zeros(1, 3, 8, 8))
-    torch.testing.assert_close(unknown, (linear_from_srgb(straight) ** (1 / 2.2) / 0.76).clamp_max(1.02))
+    torch.testing.assert_close(unknown, (linear_from_srgb(straight) ** (1 / 2.2) / 0.76).clamp_max(1.5))
     assert torch.isfinite(unlit(torch.zeros(1, 4, 8, 8), torch.zeros(1, 3, 8, 8))).all()
 
 

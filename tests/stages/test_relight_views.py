@@ -78,6 +78,27 @@ def test_one_exposure_for_all_views_from_the_diffuse_cue(inputs: tuple[Path, Pat
     assert relight_views.exposure_for(views, cues) == 1
 
 
+def test_specular_cues_are_dimmed_to_the_gloss_that_photographs_show(
+    inputs: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    capture, cues, model = inputs
+
+    def relit(cues: Path, gloss: float | None, name: str) -> dict[str, bytes]:
+        folder = tmp_path / f"illumination_{name}"
+        for view in range(3):
+            alpha = read_png(capture / "images" / f"{view:03d}.png")[..., 3]
+            write_exr(folder / "shading" / f"{view:03d}.exr", dict.fromkeys("RGB", 0.5 * alpha) | {"A": alpha})
+        write_json(folder / "light.json", {"gloss": gloss})
+        return samples(relight_views.run(capture, cues, model, folder, CONFIG, tmp_path / name))
+
+    for path in (cues / "cues").iterdir():
+        dimmed = {n: image * (0.25 if n.startswith("ggx") else 1) for n, image in read_exr(path).items()}
+        write_exr(tmp_path / "dimmed" / "cues" / path.name, dimmed)
+    assert relit(cues, 0.25, "quarter") == relit(tmp_path / "dimmed", 1.0, "full")
+    unknown = relit(cues, None, "unknown")
+    assert unknown == relit(cues, 1.0, "dielectric") != relit(cues, 0.25, "again")
+
+
 def test_existing_samples_are_kept_and_missing_ones_made(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
     out = relight_views.run(*inputs, None, CONFIG, tmp_path / "out")
     whole = samples(out)
@@ -154,6 +175,7 @@ def test_the_photographs_own_light_is_a_hint(inputs: tuple[Path, Path, Path], tm
     for view in range(3):
         slope = np.linspace(0.1, 1.5, SIZE, dtype=np.float32) * alpha
         write_exr(tmp_path / "light" / "shading" / f"{view:03d}.exr", {"R": slope, "G": slope, "B": slope, "A": alpha})
+    write_json(tmp_path / "light" / "light.json", {"gloss": None})
     plain = samples(relight_views.run(*inputs, None, CONFIG, tmp_path / "plain"))
     hinted = samples(relight_views.run(*inputs, tmp_path / "light", CONFIG, tmp_path / "hinted"))
     assert all(plain[name] != hinted[name] for name in plain)

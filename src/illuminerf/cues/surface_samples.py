@@ -171,16 +171,8 @@ def seen_colors(
     """
     colors = np.full((len(views), len(points), 3), np.nan, np.float32)
     for view in range(len(views)):
-        pixels, depth = (values[0] for values in views.cameras[view].project(points.positions))
-        toward = views.cameras.positions[view] - points.positions
-        toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-9)
-        is_turned = (toward * points.normals).sum(-1) > _LEAST_COSINE
-        index = np.flatnonzero((depth > 0) & is_turned & _is_inside(pixels, views))
-        srgb, alpha = _looked_up(views.srgb[view], views.alpha[view], pixels[index])
-        index, srgb = index[alpha > _OPAQUE], srgb[alpha > _OPAQUE]
-        starts = points.positions[index] + _OFFSET * points.normals[index]
-        is_free = np.isinf(caster.distances(starts, toward[index]))
-        colors[view, index[is_free]] = srgb[is_free]
+        seen = sightings(points, views, view, caster)
+        colors[view, seen.index] = seen.srgb
     enough = np.isfinite(colors[..., 0]).sum(0) >= max(least_views, 1)
     result = np.full((len(points), 3), np.nan, np.float32)
     # colours in sRGB sort as linear ones do
@@ -190,23 +182,47 @@ def seen_colors(
     return linear_from_srgb(result)
 
 
-def _is_inside(pixels: np.ndarray, views: Views) -> np.ndarray:
+@dataclass(frozen=True)
+class Sightings:
+    """Points that a photograph shows well.
+
+    Attributes:
+        index: int64 [seen], of the points.
+        pixels: float64 [seen, 2], where they are seen (x, y).
+        srgb: float32 [seen, 3].
+    """
+
+    index: np.ndarray
+    pixels: np.ndarray
+    srgb: np.ndarray
+
+
+def sightings(points: SurfacePoints, views: Views, view: int, caster: RayCaster) -> Sightings:
+    """The points that are turned to the camera of `view`, inside its mask and not hidden by the mesh."""
+    pixels, depth = (values[0] for values in views.cameras[view].project(points.positions))
+    toward = views.cameras.positions[view] - points.positions
+    toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-9)
+    is_turned = (toward * points.normals).sum(-1) > _LEAST_COSINE
     size = np.array([views.cameras.width, views.cameras.height])
-    inside = (pixels > 0.5) & (pixels < size - 0.5)
-    return inside[..., 0] & inside[..., 1]
+    is_inside = ((pixels > 0.5) & (pixels < size - 0.5)).all(-1)
+    index = np.flatnonzero((depth > 0) & is_turned & is_inside)
+    colour = bilinear(np.dstack([views.srgb[view], views.alpha[view]]), pixels[index])
+    is_opaque = colour[:, 3] > _OPAQUE
+    index, srgb = index[is_opaque], colour[is_opaque, :3]
+    starts = points.positions[index] + _OFFSET * points.normals[index]
+    is_free = np.isinf(caster.distances(starts, toward[index]))
+    return Sightings(index[is_free], pixels[index[is_free]], srgb[is_free])
 
 
-def _looked_up(srgb: np.ndarray, alpha: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bilinear colour [n, 3] and coverage [n] at image points (x, y) [n, 2]."""
-    image = np.dstack([srgb, alpha])
+def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Values [points, channels] of an image [height, width, channels] at image points (x, y) [points, 2] inside it."""
     at = pixels - 0.5
-    corner = np.minimum(np.floor(at).astype(int), np.array(alpha.shape[::-1]) - 2)
+    corner = np.minimum(np.floor(at).astype(int), np.array(image.shape[1::-1]) - 2)
     x, y = corner.T
     u, v = (at - corner).T[..., None]
     upper = (1 - u) * image[y, x] + u * image[y, x + 1]
     lower = (1 - u) * image[y + 1, x] + u * image[y + 1, x + 1]
-    value = (1 - v) * upper + v * lower
-    return value[:, :3], value[:, 3]
+    return (1 - v) * upper + v * lower
 
 
 def light_transport(points: SurfacePoints, caster: RayCaster, height: int) -> np.ndarray:

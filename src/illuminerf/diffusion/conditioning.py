@@ -27,7 +27,8 @@ NUM_IMAGE_CHANNELS = 4
 NUM_SHADING_CHANNELS = 3
 _USUAL_SHADING = 0.76  # coded: 0.55 in linear light, which training exposes a white object to
 _DARKEST_SHADING = 0.17  # coded
-_BRIGHTEST_UNLIT = 1.02
+_BRIGHTEST_SEEN = 1.02  # coded: what ConvNet 2 looks at
+_BRIGHTEST_UNLIT = 1.5  # coded: what products are made of; where shading is too low by half, nothing is lost yet
 _LEAST_COVERAGE = 0.05
 
 
@@ -219,7 +220,8 @@ class TextureNetwork(nn.Module):
         """What the network itself gives: the texture, or a material's offsets and gains (24 maps)."""
         patch, seen = self.config.patch, masked_image
         if self.config.is_material:
-            seen = torch.cat([masked_image, coded_cues, shading, unlit(masked_image, shading)], 1)
+            albedo = unlit(masked_image, shading).clamp_max(_BRIGHTEST_SEEN)
+            seen = torch.cat([masked_image, coded_cues, shading, albedo], 1)
         features = functional.silu(self.stem(functional.pixel_unshuffle(seen, patch)))
         skips = []
         for down in self.downs:

@@ -1,11 +1,12 @@
 """Geometry + capture -> the unknown light of the photographs, and the diffuse shading that it casts in them.
 
-light.exr, light.json  the estimated light (its gain per channel is a guess), and how well it explains the photographs
+light.exr, light.json  the estimated light (its gain per channel is a guess), how well it explains the photographs, and
+                       "gloss": 0 matt, 1 as glossy as a dielectric or more, null where photographs do not tell
 shading/<000>.exr      the diffuse radiance cue of every captured view under it: half R, G, B, linear and premultiplied,
                        and A, the mesh's coverage
 preview.png            the light, and a few photographs beside shading and albedo
 
-Deviation: not in the paper; `cues.illumination` says how it is done.
+Deviation: not in the paper; `cues.illumination` and `cues.gloss` say how it is done.
 """
 
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from illuminerf.cues.gloss import GlossFit, estimated_gloss
 from illuminerf.cues.illumination import LightFit, fit_light, uniform_light
 from illuminerf.cues.renderer import CueSampling, render_cues
 from illuminerf.cues.surface_samples import ColorGathering, RayCaster, interreflection, light_transport, seen_points
@@ -40,6 +42,8 @@ class Config:
     """Points on the surface, and their colours."""
     fit: LightFit = field(default_factory=LightFit)
     """The light that explains these colours."""
+    gloss: GlossFit = field(default_factory=GlossFit)
+    """Photographs that are asked for gloss."""
     sampling: CueSampling = CueSampling()
     """Paths and bounces of the shading; those of the radiance cues."""
     seed: int = 0
@@ -104,12 +108,14 @@ def estimated_light(mesh: TriangleMesh, views: Views, config: Config) -> tuple[E
             "so their light is taken to be uniform. Check masks, exposure, and that geometry and capture belong "
             "together."
         )
-        return uniform_light(config.fit.map_height), {**metrics, "residual": 1.0, "explained": 0.0}
+        return uniform_light(config.fit.map_height), {**metrics, "residual": 1.0, "explained": 0.0, "gloss": None}
     transport = light_transport(points, caster, config.fit.map_height)
     bounces = interreflection(points, caster, config.fit.bounce_rays, numpy_generator(config.seed, "bounces"))
     fitted = fit_light(points, colors, transport, bounces, config.fit, numpy_generator(config.seed, "pairs"))
     say(f"illumination: shading explains {fitted.explained:.0%} of the variance of log colour at {len(points)} points")
-    return fitted.light, {**metrics, "residual": fitted.residual, "explained": fitted.explained}
+    gloss = estimated_gloss(mesh, points, caster, views, fitted.light, config.sampling, config.gloss, config.seed)
+    say("illumination: gloss " + ("cannot be told" if gloss is None else f"{gloss:.0%} of a dielectric's"))
+    return fitted.light, {**metrics, "residual": fitted.residual, "explained": fitted.explained, "gloss": gloss}
 
 
 def _preview(light: EnvironmentMap, views: Views, out: Path) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Capture + radiance cues + relighting model -> S relit samples of every view (paper, section 3.3).
 
 Where an Illumination artefact is given, the embedded model also sees what the photographs' own light does to a white
-object (Deviation: the paper's model has to guess that from each photograph alone).
+object, and specular cues are dimmed to the gloss that the photographs show (Deviation: the paper's model has to guess
+both from each photograph alone).
 
 samples/<000>_<00>.png   sRGB over black (premultiplied by the capture's alpha), at the capture's size
 seeds.json               the seed of every sample
@@ -30,7 +31,7 @@ from illuminerf.diffusion.sampling import Sampler
 from illuminerf.scene.images import read_exr, write_png
 from illuminerf.scene.views import Views
 from illuminerf.workflow.artefact import open_artefact
-from illuminerf.workflow.atomic import write_json
+from illuminerf.workflow.atomic import read_json, write_json
 from illuminerf.workflow.device import Precision, autocast, derived_seed, resolve_device
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.processes import shard_of
@@ -110,7 +111,7 @@ def run(capture: Path, cues: Path, model: Path | str, illumination: Path | None,
         ours = batches[shard::num_shards]
         todo = [batch for batch in ours if not _is_relit(out, batch, config.num_samples)]
         if todo:
-            sources = _Sources(views, cues, illumination)
+            sources = _Sources(views, cues, illumination, gloss_of(illumination))
             _relight_all(folder, sources, ours, todo, seeds, config, out)
         if _is_relit(out, list(seeds), config.num_samples):
             artefact.finish({"num_views": len(views), "num_samples": config.num_samples})
@@ -134,6 +135,7 @@ class _Sources(NamedTuple):
     views: Views
     cues: Path
     illumination: Path | None
+    gloss: float
 
 
 def _relight_all(
@@ -196,9 +198,16 @@ def exposure_for(views: Views, cues: Path) -> float:
     return TRAINING_LEVEL / level if level > _DARK else 1.0
 
 
+def gloss_of(illumination: Path | None) -> float:
+    """The factor on specular cues that an Illumination artefact asks for; 1 where nothing is known."""
+    gloss = None if illumination is None else read_json(illumination / "light.json").get("gloss")
+    return 1.0 if gloss is None else float(gloss)
+
+
 def _photograph(sources: _Sources, view: int, device: torch.device) -> Photograph:
     alpha = sources.views.alpha[view]
     cues = _straight(sources.cues / "cues" / f"{view:03d}.exr", CUE_CHANNELS, alpha.shape)
+    cues[3:] *= sources.gloss
     shading = np.zeros((3, *alpha.shape), np.float32)
     if sources.illumination is not None:
         shading = _straight(sources.illumination / "shading" / f"{view:03d}.exr", "RGB", alpha.shape)
