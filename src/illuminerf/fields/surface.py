@@ -111,7 +111,7 @@ class SurfaceField(nn.Module):
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> Float[Tensor, " points"]:
         """Signed distance alone, which is cheaper."""
-        hidden, _ = _SoftplusWithSlope.apply(self.hidden(self.grid(positions, level_weights)))
+        hidden = functional.softplus(self.hidden(self.grid(positions, level_weights)), beta=_SHARPNESS)
         return self.head(hidden)[..., 0] + positions.norm(dim=-1) - self.config.initial_radius
 
     def predicted_normals(
