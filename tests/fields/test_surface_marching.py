@@ -123,6 +123,9 @@ def test_no_cell_is_missed_and_none_is_met_too_early() -> None:
     assert bool(cells.contains(origins[met] + (near[met, None] + 1e-5) * directions[met]).all())
     assert int((met & ~found).sum()) <= 5  # corners that points 0.002 apart step over
     assert bool((near[met] < far[met]).all())
+    twin = SurfaceShell(cells)._advance(origins, directions, ball_interval(origins, directions)[0] - 0.5, far)
+    kernel = SurfaceShell(cells).advance(origins, directions, ball_interval(origins, directions)[0] - 0.5, far)
+    torch.testing.assert_close(kernel, twin, rtol=0, atol=1e-4)
     # the guard: clearances that are too large miss cells
     wrong = SurfaceShell(cells)
     wrong.clearance = torch.where(wrong.clearance > 1, wrong.clearance + 1, wrong.clearance)

@@ -38,7 +38,7 @@ class RenderedImage:
 
 @torch.no_grad()
 def observed_cells(
-    field: RadianceField, cells: OccupiedCells, cameras: Cameras, min_weight: float = 0.02, stride: int = 2
+    field: RadianceField, cells: OccupiedCells, cameras: Cameras, min_weight: float = 0.02
 ) -> OccupiedCells:
     """Those of `cells` in which some camera sees something, and their neighbours.
 
@@ -47,11 +47,12 @@ def observed_cells(
 
     Args:
         min_weight: rendering weight from which a sample counts as seen.
-        stride: every `stride`-th row and column is asked.
     """
     device = cells.cells.device
     seen = torch.zeros_like(cells.cells)
     side = seen.shape[0]
+    # every second row and column; of large images fewer, about two across a cell
+    stride = max(2, min(cameras.height, cameras.width) // (2 * side))
     rows, columns = (torch.arange(0, size, stride, device=device) for size in (cameras.height, cameras.width))
     pixel = (rows[:, None] * cameras.width + columns).view(-1)
     for view in range(len(cameras)):

@@ -1,8 +1,11 @@
 """The cells that a fitted surface can be seen in, fine ones, and how rays get from one to the next."""
 
+from typing import no_type_check
+
 import numpy as np
 import torch
 from jaxtyping import Float
+from numba import njit, prange
 from scipy import ndimage
 from torch import Tensor
 
@@ -13,7 +16,8 @@ _REACH = 10.0  # in units of beta: a ray along the surface at this distance gath
 _CELL = 3.0  # cells are at most so many betas wide
 _FINEST = 128  # finer ones save less than they cost
 _CHUNK = 1 << 15
-_NUDGE = 1e-3  # in cells: positions land behind a boundary, not on it
+_NUDGE = np.float32(1e-3)  # in cells: positions land behind a boundary, not on it
+_PARALLEL = np.float32(1e-9)  # slopes below it never leave a cell
 
 
 class SurfaceShell:
@@ -39,9 +43,9 @@ class SurfaceShell:
     ) -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"]]:
         """Where rays first are in an occupied cell, and where they leave the box of all of them; near = infinity
         where they miss."""
-        inverse = 1 / torch.where(directions.abs() < 1e-9, 1e-9, directions)
+        inverse = 1 / torch.where(directions.abs() < float(_PARALLEL), float(_PARALLEL), directions)
         ends = torch.stack([(self._low - origins) * inverse, (self._high - origins) * inverse])
-        near = ends.amin(0).amax(-1).clamp_min(0) + _NUDGE * 2 / self.side
+        near = ends.amin(0).amax(-1).clamp_min(0) + float(_NUDGE) * 2 / self.side
         far = ends.amax(0).amin(-1)
         return self.advance(origins, directions, near, far), far
 
@@ -57,6 +61,15 @@ class SurfaceShell:
         No cell is missed: around a cell of clearance c the cube of 2c - 1 cells per side is empty, and the ray goes on
         where it leaves that cube (Amanatides and Woo's traversal, in larger steps).
         """
+        if origins.is_cuda:
+            return self._advance(origins, directions, distance, far)
+        result = torch.empty_like(distance)
+        rays = (part.contiguous().numpy() for part in (origins, directions, distance, far))
+        _advance_kernel(self.clearance.numpy(), np.float32(self.side), *rays, result.numpy())
+        return result
+
+    def _advance(self, origins: Tensor, directions: Tensor, distance: Tensor, far: Tensor) -> Tensor:
+        """The kernel's twin."""
         half = self.side / 2
         result = torch.where(distance < far, distance, torch.inf)
         moving = (distance < far).nonzero()[:, 0]
@@ -68,13 +81,40 @@ class SurfaceShell:
             x, y, z = cell.unbind(-1)
             clearance = self.clearance[(x * self.side + y) * self.side + z].to(place.dtype)
             ahead = torch.where(slope > 0, clearance[:, None], 1 - clearance[:, None])
-            steps = (cell + ahead - place) / torch.where(slope.abs() < 1e-9, 1e-9, slope)
-            steps = torch.where(slope.abs() < 1e-9, torch.inf, steps).amin(-1).clamp_min(0) + _NUDGE / half
-            at = torch.where(clearance > 0, at + steps, at)
+            is_along = slope.abs() < float(_PARALLEL)
+            steps = torch.where(is_along, torch.inf, (cell + ahead - place) / torch.where(is_along, 1, slope))
+            at = torch.where(clearance > 0, at + steps.amin(-1).clamp_min(0) + float(_NUDGE) / half, at)
             result[moving] = torch.where(at < limit, at, torch.inf)
             go_on = ((clearance > 0) & (at < limit)).nonzero()[:, 0]
             moving, scaled, slope, at, limit = (part[go_on] for part in (moving, scaled, slope, at, limit))
         return result
+
+
+@njit(parallel=True, cache=True)
+@no_type_check
+def _advance_kernel(clearance, side, origins, directions, distance, far, result):
+    half, last, zero = side / np.float32(2), int(side) - 1, np.float32(0)
+    for ray in prange(len(distance)):
+        at = distance[ray]
+        result[ray] = np.inf
+        while at < far[ray]:
+            index = 0
+            for axis in range(3):
+                place = origins[ray, axis] * half + half + at * directions[ray, axis] * half
+                index = index * (last + 1) + min(max(int(place), 0), last)
+            free = np.float32(clearance[index])
+            if free == zero:
+                result[ray] = at
+                break
+            step = np.float32(np.inf)
+            for axis in range(3):
+                slope = directions[ray, axis] * half
+                if abs(slope) >= _PARALLEL:
+                    place = origins[ray, axis] * half + half + at * slope
+                    cell = np.float32(min(max(int(place), 0), last))
+                    end = cell + free if slope > zero else cell + np.float32(1) - free
+                    step = min(step, (end - place) / slope)
+            at += max(step, zero) + _NUDGE / half
 
 
 def _clearance(occupied: np.ndarray) -> Tensor:

@@ -127,9 +127,9 @@ def _fit(
     checkpoint: Path,
 ) -> None:
     device = hull.cells.device
-    pool = gather_rays(views.cameras[fitted], views.alpha[fitted], hull, device)
-    srgb = pool.values(views.premultiplied()[fitted])
-    alpha = pool.values(views.alpha[fitted]) if has_masks else None
+    pool = gather_rays(views.cameras[fitted], views.alphas(fitted), hull, device)
+    srgb = pool.values(views.premultiplied(fitted))
+    alpha = pool.values(views.alphas(fitted)) if has_masks else None
 
     def step_loss(step: int) -> tuple[torch.Tensor, dict[str, float]]:
         generator = torch_generator(config.seed, "geometry", step, device=device)
@@ -147,7 +147,7 @@ def _fit(
 def _bounds(views: Views, has_masks: bool, side: int, device: torch.device) -> OccupiedCells:
     if not has_masks:
         return OccupiedCells(torch.ones(side, side, side, dtype=torch.bool, device=device))
-    return OccupiedCells(visual_hull(views.cameras, views.alpha, side).to(device)).dilated(1)
+    return OccupiedCells(visual_hull(views.cameras, views.alphas(), side).to(device)).dilated(1)
 
 
 def _split(num_views: int, num_held_out: int) -> tuple[list[int], list[int]]:
