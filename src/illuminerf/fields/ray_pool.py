@@ -120,7 +120,7 @@ def gather_rays(
             for kept, rays in ((is_covered, covered), (~is_covered, beside)):
                 kept = kept & (far > near)
                 rays.append((index[kept].int(), pixel[kept].int(), near[kept], far[kept]))
-    columns = [torch.cat(parts) for parts in zip(*covered, *beside, strict=True)]
-    if not len(columns[0]):
+    views, pixels, nears, fars = (torch.cat(parts) for parts in zip(*covered, *beside, strict=True))
+    if not len(views):
         raise UserError("no camera ray meets the object's bounds", fix="check the capture's cameras and scale")
-    return RayPool(*columns, sum(len(rays[0]) for rays in covered), cameras)
+    return RayPool(views, pixels, nears, fars, sum(len(rays[0]) for rays in covered), cameras)
