@@ -15,14 +15,14 @@ from illuminerf.fields.shell import SurfaceShell
 from illuminerf.fields.surface import SurfaceField
 from illuminerf.fields.volume_rendering import laplace_density
 
-_STRIDE = 0.6  # of the signed distance, which may grow faster than it should
+_STRIDE = 0.4  # of the signed distance, which may grow faster than it should
 _FINEST_STEP = 0.75  # in units of beta
 _GROWTH = 0.5  # steps may be longer by this share per unit of optical depth: less is seen of what they find
 _MAX_STEPS = 1000
 _OPAQUE = 7.0  # optical depth behind which less than a quarter of a grey level is seen
 _LEAST_WEIGHT = 1e-5
-_LARGEST_SHARE = 0.1  # of a ray's opacity that one shading point may stand for
-_LONGEST_STRETCH = 8.0  # and how much of the ray, in units of beta
+_LARGEST_SHARE = 0.03  # of a ray's opacity that one shading point may stand for
+_LONGEST_STRETCH = 4.0  # and how much of the ray, in units of beta
 _CHUNK = 1 << 13
 
 
@@ -114,7 +114,7 @@ def march(
 
 
 def shading_places(samples: RayWeights, surface: SurfaceField) -> RayWeights:
-    """Fewer places that stand for all samples: what is seen of an opaque surface is shaded at about ten."""
+    """Fewer places that stand for all samples: what is seen of an opaque surface is shaded at a few dozen."""
     return samples.merged(_LONGEST_STRETCH * float(surface.beta.detach()))
 
 
