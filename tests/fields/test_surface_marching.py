@@ -193,7 +193,7 @@ def test_where_the_weight_of_an_interval_lies() -> None:
 def test_merging_keeps_mass_and_mean_and_never_joins_surfaces() -> None:
     ray = torch.tensor([0] * 6 + [2] * 4)
     distance = torch.tensor([1.0, 1.01, 1.02, 1.03, 1.04, 2.0, 3.0, 3.01, 3.02, 3.03])
-    weight = torch.tensor([0.002, 0.003, 0.004, 0.5, 0.3, 0.1, 0.01, 0.01, 0.01, 0.01])
+    weight = torch.tensor([0.002, 0.003, 0.004, 0.5, 0.3, 0.1, 0.005, 0.005, 0.005, 0.005])
     merged = RayWeights(ray, distance, weight).merged(0.1)
     assert merged.ray.tolist() == [0, 0, 0, 0, 2]
     values = torch.stack([distance, torch.ones_like(distance)], -1)
