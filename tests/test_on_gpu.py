@@ -6,8 +6,12 @@ import pytest
 import torch
 
 from illuminerf.diffusion.sampling import sample_relit
+from illuminerf.fields.bounds import OccupiedCells
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
+from illuminerf.fields.image_rendering import render_image
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
+from illuminerf.fields.shell import surface_shell
+from illuminerf.scene.cameras import turntable_cameras
 from tests.diffusion.tiny import random_condition_inputs, tiny_model, with_noise_in_every_weight
 
 pytestmark = [
@@ -31,6 +35,22 @@ def test_hash_grid_and_the_gradient_of_its_table() -> None:
     # the guard: the next cell's features are others
     shifted, _ = grid.with_jacobian((positions + 0.1).to("cuda"))
     assert (shifted.detach().cpu() - outputs[0][0]).abs().max() > 1e-6
+
+
+def test_an_image_of_a_field() -> None:
+    torch.manual_seed(0)
+    field = RadianceField(FieldConfig.embedded())
+    with torch.no_grad():
+        field.appearance.grid.table.normal_()
+    camera = turntable_cameras(1, 2.5, 0.6, 24, 32)
+    images = []
+    for device in ("cpu", "cuda"):
+        cells = OccupiedCells(torch.ones(16, 16, 16, dtype=torch.bool, device=device))
+        images.append(render_image(field, surface_shell(field.to(device).surface, cells), camera, 0))
+    for name, wanted in vars(images[0]).items():
+        assert abs(getattr(images[1], name) - wanted).max() < 2e-3, name
+    # the guard: pixels differ from each other by more
+    assert images[0].srgb.std() > 0.05
 
 
 def test_signed_distance_of_a_field() -> None:

@@ -43,7 +43,7 @@ def imported_alpha(folder: Path, images: np.ndarray, config: Config = PLAIN) -> 
     write_plain(folder / "source", CAMERAS, images)
     capture = load_capture(run(folder / "source", config, folder / "capture"))
     assert capture.background == "masked"
-    return capture.views.alpha
+    return np.asarray(capture.views.alpha)
 
 
 def iou(alpha: np.ndarray) -> float:
@@ -63,7 +63,7 @@ def test_masks_are_the_truth_before_any_plain_colour(tmp_path: Path, colour: str
 def test_outlines_lose_the_backdrops_colour(tmp_path: Path) -> None:
     write_plain(tmp_path / "source", CAMERAS, photographs(np.array(COLOURS["green"])))
     views = load_capture(run(tmp_path / "source", PLAIN, tmp_path / "capture")).views
-    edge = (ALPHA > 0.3) & (ALPHA < 0.7) & (views.alpha > 0.1)
+    edge = (ALPHA > 0.3) & (ALPHA < 0.7) & (np.asarray(views.alpha) > 0.1)
     truth = srgb_from_linear(LINEAR / np.maximum(ALPHA, 1e-3)[..., None])[edge]
     mixed = photographs(np.array(COLOURS["green"]))[edge] / 255
     error = np.abs(views.srgb[edge] - truth).mean()

@@ -77,3 +77,15 @@ def test_ray_pool_holds_all_foreground_and_little_else() -> None:
     assert bool((near <= entry + 1e-3).all()) and bool((far >= leave - 1e-3).all())
     chosen = pool.draw(1000, torch.Generator().manual_seed(0), foreground_share=0.8)
     assert int((chosen < pool.num_foreground).sum()) == 800
+
+
+def test_values_of_a_pool_are_those_of_its_pixels() -> None:
+    cameras, masks = _sphere_views(0.5, num_views=4)
+    pool = gather_rays(cameras, masks, OccupiedCells(visual_hull(cameras, masks, 32)).dilated(1))
+    images = np.random.default_rng(0).random((4, 48, 48, 3), np.float32)
+    wanted = torch.from_numpy(images.reshape(4, -1, 3))[pool.view.long(), pool.pixel.long()]
+    assert torch.equal(pool.values(iter(images)), wanted)
+    assert not torch.equal(pool.values(images[::-1]), wanted)
+    few = pool.foreground_subset(100, torch.Generator().manual_seed(0))
+    alpha = few.values(image[..., 0] for image in images)
+    assert torch.equal(alpha, torch.from_numpy(images.reshape(4, -1, 3))[few.view.long(), few.pixel.long(), 0])

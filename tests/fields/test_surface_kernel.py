@@ -64,6 +64,20 @@ def test_values_and_derivatives_are_the_twins(num_features: int, levels: Tensor 
             assert float((one - other).abs().max()) < 2e-3 * scale, name
 
 
+@pytest.mark.parametrize("levels", [None, _LEVELS])
+def test_the_distance_alone_is_the_same(levels: Tensor | None) -> None:
+    surface, positions = _surface(), _positions()
+    with torch.no_grad():
+        exact = copy.deepcopy(surface).double().signed_distance(positions.double(), levels)
+        alone = surface.signed_distance(positions, levels)
+        other = surface.signed_distance(positions, _LEVELS if levels is None else None)
+    torch.testing.assert_close(alone.double(), exact, rtol=0, atol=2e-6)
+    # the guard: other weights of the levels are told apart
+    assert float((other.double() - exact).abs().max()) > 2e-4
+    # with gradients it is differentiable
+    assert surface.signed_distance(positions, levels).requires_grad and not alone.requires_grad
+
+
 def test_without_the_curvature_of_the_softplus_the_gradient_is_another_one() -> None:
     surface, positions = _surface().double(), _positions().double()
     features, jacobian = surface.grid.with_jacobian(positions)

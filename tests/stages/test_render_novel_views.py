@@ -94,6 +94,19 @@ def test_cameras_from_a_file_and_resume(sphere_field: Path, tmp_path: Path) -> N
     assert (out / "images" / "000.png").stat().st_mtime_ns == kept
 
 
+def test_a_number_of_samples_asks_for_those_of_training(sphere_geometry: Path, tmp_path: Path) -> None:
+    """On a real fit the default is closer to many samples than as many as in training are."""
+    configs = {"marched": None, "few": 10, "many": 160}
+    images = {}
+    for name, num_samples in configs.items():
+        config = render_novel_views.Config(turntable=_TURNTABLE, num_samples=num_samples, device="cpu")
+        out = render_novel_views.run(sphere_geometry, None, config, tmp_path / name)
+        pixels = np.stack([read_png(out / "images" / f"{view:03d}.png") for view in range(3)])
+        images[name] = pixels[..., :3] * pixels[..., 3:]
+    errors = {name: np.abs(images[name] - images["many"]).mean() for name in ("marched", "few")}
+    assert errors["marched"] < 0.5 * errors["few"] and errors["few"] > 0, errors
+
+
 def test_errors(sphere_field: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="latent code 9"):
         wrong = render_novel_views.Config(turntable=_TURNTABLE, latent_index=9, device="cpu")

@@ -11,6 +11,7 @@ from illuminerf.data.capture import load_capture, write_capture
 from illuminerf.fields.image_rendering import render_image
 from illuminerf.fields.mesh_fit import SurfaceRegressionConfig
 from illuminerf.fields.optimisation import OptimiserConfig
+from illuminerf.fields.shell import surface_shell
 from illuminerf.fields.storage import load_field
 from illuminerf.scene.meshes import TriangleMesh, sphere_mesh
 from illuminerf.stages import render_novel_views, use_mesh
@@ -65,7 +66,7 @@ def test_the_artefact_is_that_of_an_estimated_geometry(geometry: Path, sphere_ge
 
 def test_the_field_is_the_mesh_and_shows_the_photographs(geometry: Path, capture: Path) -> None:
     stored, views = load_field(geometry), load_capture(capture).views
-    image = render_image(stored.field, stored.cells, views.cameras, 3)
+    image = render_image(stored.field, surface_shell(stored.field.surface, stored.cells), views.cameras, 3)
     both = (image.alpha > 0.5) & (views.alpha[3] > 0.5)
     assert both.sum() / ((image.alpha > 0.5) | (views.alpha[3] > 0.5)).sum() > 0.85
     origins, directions = (rays.numpy() for rays in views.cameras.image_rays(3))

@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 
 from illuminerf.scene.cameras import Cameras
-from illuminerf.scene.images import read_png, write_png
-from illuminerf.scene.views import Views
+from illuminerf.scene.images import read_png_bytes, write_png
+from illuminerf.scene.views import EightBitImages, Views
 from illuminerf.workflow.atomic import read_json, write_json
 from illuminerf.workflow.errors import UserError
 
@@ -87,10 +87,10 @@ def save_capture(folder: Path, capture: Capture) -> None:
     )
 
 
-def load_capture(folder: Path) -> Capture:
-    """Read the capture in `folder`.
+def load_cameras(folder: Path) -> Cameras:
+    """The cameras of the capture in `folder`, for those who need no pixels.
 
-    Raises UserError where it is missing, unfinished, corrupt, or its images are not those of its cameras.
+    Raises UserError where it is missing or unfinished.
     """
     if not (folder / "capture.json").is_file():
         raise UserError(
@@ -99,14 +99,21 @@ def load_capture(folder: Path) -> Capture:
         )  # fmt: skip
     if (folder / "config.json").exists() and not (folder / "DONE").exists():
         raise UserError(f"the capture {folder} is unfinished", fix="import it again; what is done is kept")
+    return Cameras.from_dict(read_json(folder / "cameras.json"))
+
+
+def load_capture(folder: Path) -> Capture:
+    """Read the capture in `folder`.
+
+    Raises UserError where it is missing, unfinished, corrupt, or its images are not those of its cameras.
+    """
+    cameras = load_cameras(folder)
     content = read_json(folder / "capture.json")
-    cameras = Cameras.from_dict(read_json(folder / "cameras.json"))
     num_views = len(cameras)
-    srgb = np.empty((num_views, cameras.height, cameras.width, 3), np.float32)
-    alpha = np.empty((num_views, cameras.height, cameras.width), np.float32)
+    pixels = np.empty((num_views, cameras.height, cameras.width, 4), np.uint8)
 
     def read(view: int) -> None:
-        image = read_png(image_path(folder, view))
+        image = read_png_bytes(image_path(folder, view))
         if image.shape != (cameras.height, cameras.width, 4):
             raise UserError(
                 f"image {view} of the capture {folder} has the wrong shape",
@@ -114,13 +121,13 @@ def load_capture(folder: Path) -> Capture:
                 wanted=f"{cameras.height} x {cameras.width} x 4",
                 fix="import the capture again into a new folder",
             )
-        srgb[view], alpha[view] = image[..., :3], image[..., 3]
+        pixels[view] = image
 
     with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:  # decoding leaves the interpreter's lock
         list(pool.map(read, range(num_views)))
     try:
         return Capture(
-            Views(cameras, srgb, alpha),
+            Views(cameras, EightBitImages(pixels[..., :3]), EightBitImages(pixels[..., 3])),
             tuple(map(str, content["names"])),
             float(content["scale"]),
             np.array(content["offset"], np.float64),

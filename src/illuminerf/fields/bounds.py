@@ -1,5 +1,6 @@
 """Where the object can be: the unit ball, and inside it the cells that no mask rules out."""
 
+from collections.abc import Iterable
 from typing import no_type_check
 
 import numpy as np
@@ -110,11 +111,11 @@ def _march_kernel(cells, origins, directions, near, far, steps, first, last):
                 break
 
 
-def visual_hull(cameras: Cameras, alpha: np.ndarray, side: int) -> Bool[Tensor, "side side side"]:
+def visual_hull(cameras: Cameras, alpha: Iterable[np.ndarray], side: int) -> Bool[Tensor, "side side side"]:
     """Cells of the ball that some pixel with alpha > 0.5 sees in every view whose image they fall into.
 
     Args:
-        alpha: float32 [views, height, width].
+        alpha: float32 [height, width] per view.
 
     Raises:
         UserError: nothing is left, because masks and cameras do not fit together.
@@ -123,12 +124,12 @@ def visual_hull(cameras: Cameras, alpha: np.ndarray, side: int) -> Bool[Tensor, 
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     inside = (points**2).sum(-1) < 1
     # a voxel may cover several pixels, so a mask counts as far as half a voxel reaches
-    for view in range(len(cameras)):
+    for view, coverage in enumerate(alpha):
         candidates = np.flatnonzero(inside)
         image_points, depth = cameras[view].project(points[candidates])
         nearest = max(float(depth[0].min(initial=1e6)), 0.1)
         reach = 0.87 * (2 / side) * cameras.intrinsics[view, 0] / nearest + 1
-        mask = alpha[view] > 0.5
+        mask = coverage > 0.5
         grown = ndimage.distance_transform_edt(~mask) <= reach
         column, row = np.floor(image_points[0]).astype(int).T
         seen = (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height) & (depth[0] > 0)

@@ -1,6 +1,7 @@
 """The pixels worth training on: those whose rays meet the object's bounds."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,11 +19,11 @@ _CHUNK = 1 << 16
 
 @dataclass
 class RayPool:
-    """Rays of many views in one axis, foreground first.
+    """Rays of many views in one axis, foreground first, both parts in the order of the views.
 
     Attributes:
-        view: which view each ray belongs to.
-        pixel: row * width + column.
+        view: which view each ray belongs to; int32, as there are many.
+        pixel: row * width + column; int32.
         near, far: the stretch of the ray inside the bounds.
         num_foreground: rays [0, num_foreground) are covered.
     """
@@ -56,16 +57,29 @@ class RayPool:
         parts = (self.view[chosen], self.pixel[chosen], self.near[chosen], self.far[chosen])
         return RayPool(*parts, len(chosen), self.cameras)
 
-    def values(self, images: np.ndarray) -> Tensor:
-        """Values of images [views, height, width, ...] at the rays' pixels: [rays, ...]."""
-        flat = torch.from_numpy(images.reshape(len(images), -1, *images.shape[3:]))
-        return flat[self.view.cpu(), self.pixel.cpu()].to(self.view.device)
+    def values(self, images: Iterable[np.ndarray]) -> Tensor:
+        """Values of images [height, width, ...] at the rays' pixels: [rays, ...].
+
+        Args:
+            images: one of every view; they may be made one at a time.
+        """
+        views, pixel = self.view.cpu().numpy(), self.pixel.cpu().numpy()
+        parts = (0, views[: self.num_foreground]), (self.num_foreground, views[self.num_foreground :])
+        result = np.empty(0, np.float32)
+        for view, image in enumerate(images):
+            flat = image.reshape(-1, *image.shape[2:])
+            if not view:
+                result = np.empty((len(self), *flat.shape[1:]), flat.dtype)
+            for first, part in parts:
+                start, end = first + np.searchsorted(part, [view, view + 1])
+                result[start:end] = flat[pixel[start:end]]
+        return torch.from_numpy(result).to(self.view.device)
 
     def rays(
         self, index: Int[Tensor, " batch"]
     ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"], Float[Tensor, " batch"], Float[Tensor, " batch"]]:
         """Origins, unit directions, near, far."""
-        origins, directions = pixel_rays(self.cameras, self.view[index], self.pixel[index])
+        origins, directions = pixel_rays(self.cameras, self.view[index].long(), self.pixel[index].long())
         return origins, directions, self.near[index], self.far[index]
 
 
@@ -79,7 +93,7 @@ def pixel_rays(
 
 def gather_rays(
     cameras: Cameras,
-    alpha: np.ndarray,
+    alpha: Iterable[np.ndarray],
     cells: OccupiedCells,
     device: torch.device | str = "cpu",
     least_coverage: float = 0.0,
@@ -87,35 +101,26 @@ def gather_rays(
     """All pixels whose rays meet occupied cells.
 
     Args:
-        alpha: float32 [views, height, width]; only says which rays are foreground and which are too far from it.
+        alpha: float32 [height, width] of every view; only says which rays are foreground and which are too far from it.
         least_coverage: foreground is what has more.
 
     Raises:
         UserError: no ray meets the bounds.
     """
     margin = math.ceil(3 * cameras.width / cells.cells.shape[0]) + 2
-    views, pixels, nears, fars, foreground = [], [], [], [], []
-    for view in range(len(cameras)):
-        candidates = np.flatnonzero(ndimage.distance_transform_edt(alpha[view] <= 0) <= margin)
+    covered: list[tuple[Tensor, ...]] = []
+    beside: list[tuple[Tensor, ...]] = []
+    for view, image in enumerate(alpha):
+        candidates = np.flatnonzero(ndimage.distance_transform_edt(image <= 0) <= margin)
         for chunk in np.array_split(candidates, max(1, math.ceil(len(candidates) / _CHUNK))):
             pixel = torch.from_numpy(chunk).to(device)
             index = torch.full_like(pixel, view)
             near, far = cells.clip(*pixel_rays(cameras, index, pixel))
-            hit = far > near
-            views.append(index[hit])
-            pixels.append(pixel[hit])
-            nears.append(near[hit])
-            fars.append(far[hit])
-            foreground.append(torch.from_numpy(alpha[view].reshape(-1)[chunk] > least_coverage).to(device)[hit])
-    is_foreground = torch.cat(foreground)
-    if not len(is_foreground):
+            is_covered = torch.from_numpy(image.reshape(-1)[chunk] > least_coverage).to(device)
+            for kept, rays in ((is_covered, covered), (~is_covered, beside)):
+                kept = kept & (far > near)
+                rays.append((index[kept].int(), pixel[kept].int(), near[kept], far[kept]))
+    views, pixels, nears, fars = (torch.cat(parts) for parts in zip(*covered, *beside, strict=True))
+    if not len(views):
         raise UserError("no camera ray meets the object's bounds", fix="check the capture's cameras and scale")
-    order = torch.cat([is_foreground.nonzero()[:, 0], (~is_foreground).nonzero()[:, 0]])
-    return RayPool(
-        torch.cat(views)[order],
-        torch.cat(pixels)[order],
-        torch.cat(nears)[order],
-        torch.cat(fars)[order],
-        int(is_foreground.sum()),
-        cameras,
-    )
+    return RayPool(views, pixels, nears, fars, sum(len(rays[0]) for rays in covered), cameras)

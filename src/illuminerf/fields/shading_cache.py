@@ -58,10 +58,14 @@ def cache_shading(field: RadianceField, pool: RayPool, num_kept: int) -> Shading
     Args:
         num_kept: heaviest samples to keep per ray.
     """
-    parts: list[tuple[Tensor, ...]] = []
     num_kept = min(num_kept, field.config.num_samples)
-    chunks = torch.arange(pool.num_foreground, device=pool.view.device).split(_CHUNK)
-    for index in track(chunks, "find shading points", math.ceil(pool.num_foreground / _CHUNK)):
+    rays, device = pool.num_foreground, pool.view.device
+    # filled in place: parts to be joined would take the same room again
+    shapes = ((3,), (num_kept, 3), (num_kept,), (num_kept, 3))
+    cache = ShadingCache(*(torch.empty(rays, *shape, device=device) for shape in shapes))
+    for index in track(
+        torch.arange(rays, device=device).split(_CHUNK), "find shading points", math.ceil(rays / _CHUNK)
+    ):
         origins, directions, near, far = pool.rays(index)
         samples = field.sample(origins, directions, near, far)
         weights, chosen = samples.weights.topk(num_kept, dim=-1)
@@ -75,8 +79,9 @@ def cache_shading(field: RadianceField, pool: RayPool, num_kept: int) -> Shading
             torch.nn.functional.normalize(samples.gradients.gather(1, spread), dim=-1, eps=1e-6).reshape(-1, 3),
         )
         _, normals = field.shading_normals(flat)
-        parts.append((directions, positions, weights, normals.view_as(positions)))
-    return ShadingCache(*(torch.cat(tensors) for tensors in zip(*parts, strict=True)))
+        cache.directions[index], cache.positions[index] = directions, positions
+        cache.weights[index], cache.normals[index] = weights, normals.view_as(positions)
+    return cache
 
 
 def latent_loss(

@@ -1,7 +1,7 @@
 """The surface: a signed distance with its normals, and the predicted normals."""
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from illuminerf.fields.bounds import OccupiedCells
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
-from illuminerf.fields.surface_kernel import FusedSurface
+from illuminerf.fields.surface_kernel import FusedSurface, distance_alone
 from illuminerf.fields.volume_rendering import optical_depth
 from illuminerf.workflow.errors import UserError
 
@@ -83,12 +83,10 @@ class SurfaceField(nn.Module):
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> SurfacePoint:
         """Signed distance and its gradient."""
-        if positions.is_cuda or positions.dtype != torch.float32 or not len(positions):
-            distance, gradient = self.residual(*self.grid.with_jacobian(positions, level_weights))
+        if self._has_kernel(positions):
+            distance, gradient = FusedSurface.apply(*self._kernel_inputs(positions, level_weights))
         else:
-            levels = torch.ones(self.config.grid.num_levels) if level_weights is None else level_weights
-            layers = (self.hidden.weight, self.hidden.bias, self.head.weight)
-            distance, gradient = FusedSurface.apply(self.grid.table, *layers, positions, self.grid.layout, levels)
+            distance, gradient = self.residual(*self.grid.with_jacobian(positions, level_weights))
         distance = distance + self.head.bias - self.config.initial_radius
         radius = positions.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         return SurfacePoint(distance + radius[..., 0], gradient + positions / radius)
@@ -110,9 +108,21 @@ class SurfaceField(nn.Module):
     def signed_distance(
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> Float[Tensor, " points"]:
-        """Signed distance alone, which is cheaper."""
-        hidden, _ = _SoftplusWithSlope.apply(self.hidden(self.grid(positions, level_weights)))
-        return self.head(hidden)[..., 0] + positions.norm(dim=-1) - self.config.initial_radius
+        """Signed distance alone, which is cheaper, most of all where no gradients are recorded."""
+        if self._has_kernel(positions) and not torch.is_grad_enabled():
+            distance = distance_alone(*self._kernel_inputs(positions, level_weights))
+        else:
+            hidden = functional.softplus(self.hidden(self.grid(positions, level_weights)), beta=_SHARPNESS)
+            distance = functional.linear(hidden, self.head.weight)[..., 0]
+        return distance + self.head.bias + positions.norm(dim=-1) - self.config.initial_radius
+
+    def _has_kernel(self, positions: Tensor) -> bool:
+        return not positions.is_cuda and positions.dtype == torch.float32 and len(positions) > 0
+
+    def _kernel_inputs(self, positions: Tensor, level_weights: Tensor | None) -> tuple[Any, ...]:
+        levels = torch.ones(self.config.grid.num_levels) if level_weights is None else level_weights
+        layers = (self.hidden.weight, self.hidden.bias, self.head.weight)
+        return (self.grid.table, *layers, positions, self.grid.layout, levels)
 
     def predicted_normals(
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None

@@ -84,6 +84,28 @@ def _forward_layers(features, jacobian, first, bias, last, by_feature, hidden, s
 
 @njit(parallel=True, cache=True, fastmath=FAST)
 @no_type_check
+def _distance_layers(features, first, bias, last, distance):
+    num_levels, num_features, num_hidden = first.shape
+    num_parts = _NUM_PARTS
+    for part in prange(num_parts):
+        h = np.empty(num_hidden, np.float32)
+        for n in range(part * len(distance) // num_parts, (part + 1) * len(distance) // num_parts):
+            for k in range(num_hidden):
+                h[k] = bias[k]
+            for level in range(num_levels):
+                for f in range(num_features):
+                    value = features[n, level, f]
+                    for k in range(num_hidden):
+                        h[k] += value * first[level, f, k]
+            total = _ZERO
+            for k in range(num_hidden):
+                softplus, _ = softplus_with_slope(h[k])
+                total += softplus * last[k]
+            distance[n] = total
+
+
+@njit(parallel=True, cache=True, fastmath=FAST)
+@no_type_check
 def _backward_layers(
     features, jacobian, hidden, slope, first, last, distance_grad, gradient_grad,
     features_grad, first_grads, bias_grads, last_grads,
@@ -169,6 +191,23 @@ class FusedSurface(torch.autograd.Function):
         first_grad, bias_grad, last_grad = (torch.from_numpy(part.sum(0)) for part in sums)
         weight_grad = first_grad.view(-1, num_hidden).T.contiguous()
         return table_grad, weight_grad, bias_grad, last_grad[None], None, None, None
+
+
+def distance_alone(
+    table: Tensor, weight: Tensor, bias: Tensor, last: Tensor, positions: Tensor, layout: np.ndarray,
+    level_weights: Tensor,
+) -> Tensor:  # fmt: skip
+    """The distance of `FusedSurface`, for those who need no derivative of any kind."""
+    num_features, halves = table.shape[1], half_resolutions(layout, np.dtype(np.float32))
+    features = _levels_outermost(len(layout), len(positions), num_features)
+    places = positions.detach().contiguous().numpy()
+    # the Jacobian is not asked for, so that any array of its kind will do
+    grid_forward(places, table.detach().numpy(), layout, halves, features, features[..., None], False)
+    features *= level_weights.detach().numpy().astype(np.float32)[:, None]
+    first = np.ascontiguousarray(weight.detach().numpy().T).reshape(len(layout), num_features, len(weight))
+    distance = np.empty(len(positions), np.float32)
+    _distance_layers(features, first, bias.detach().numpy(), last.detach().numpy()[0], distance)
+    return torch.from_numpy(distance)
 
 
 def _levels_outermost(num_levels: int, num_points: int, *rest: int) -> np.ndarray:

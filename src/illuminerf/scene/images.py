@@ -48,10 +48,19 @@ def read_png(path: Path) -> np.ndarray:
     Raises:
         UserError: the file is missing or not an image.
     """
+    return read_png_bytes(path).astype(np.float32) / 255.0
+
+
+def read_png_bytes(path: Path) -> np.ndarray:
+    """Read an 8-bit PNG as uint8 [height, width, 3 or 4].
+
+    Raises:
+        UserError: the file is missing or not an image.
+    """
     try:
         with Image.open(path) as image:
             mode = "RGBA" if "A" in image.getbands() else "RGB"
-            return np.asarray(image.convert(mode), np.float32) / 255.0
+            return np.asarray(image.convert(mode))
     except FileNotFoundError as error:
         raise UserError(f"{path} is missing", fix="check the path") from error
     except (OSError, SyntaxError, ValueError) as error:

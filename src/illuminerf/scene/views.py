@@ -1,11 +1,37 @@
 """Images with their cameras."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from illuminerf.scene.cameras import Cameras
 from illuminerf.workflow.errors import UserError
+
+
+class EightBitImages:
+    """A stack of images kept as bytes, a quarter of what floats take; what is indexed comes out as float32 in [0, 1].
+
+    Args:
+        stored: uint8 [views, height, width, ...].
+    """
+
+    def __init__(self, stored: np.ndarray) -> None:
+        self._stored = stored
+        self.shape = stored.shape
+
+    def __len__(self) -> int:
+        return len(self._stored)
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return self._stored[index].astype(np.float32) / 255.0
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return (self[view] for view in range(len(self)))
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self[:], dtype)
 
 
 @dataclass(frozen=True)
@@ -19,8 +45,8 @@ class Views:
     """
 
     cameras: Cameras
-    srgb: np.ndarray
-    alpha: np.ndarray
+    srgb: np.ndarray | EightBitImages
+    alpha: np.ndarray | EightBitImages
 
     def __post_init__(self) -> None:
         wanted = (len(self.cameras), self.cameras.height, self.cameras.width)
@@ -34,6 +60,12 @@ class Views:
     def __len__(self) -> int:
         return len(self.cameras)
 
-    def premultiplied(self) -> np.ndarray:
-        """sRGB values times alpha, that is over black: float32 [views, height, width, 3]."""
-        return self.srgb * self.alpha[..., None]
+    def alphas(self, views: Iterable[int] | None = None) -> Iterator[np.ndarray]:
+        """Coverage, view by view: float32 [height, width]."""
+        return (self.alpha[view] for view in (range(len(self)) if views is None else views))
+
+    def premultiplied(self, views: Iterable[int] | None = None) -> Iterator[np.ndarray]:
+        """sRGB values times alpha, that is over black, view by view: float32 [height, width, 3]."""
+        return (
+            self.srgb[view] * self.alpha[view][..., None] for view in (range(len(self)) if views is None else views)
+        )

@@ -15,6 +15,7 @@ from illuminerf.fields.meshing import extract_mesh
 from illuminerf.fields.optimisation import OptimiserConfig, fit
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
 from illuminerf.fields.ray_pool import gather_rays
+from illuminerf.fields.shell import SurfaceShell, surface_shell
 from illuminerf.fields.storage import StoredField, save_field
 from illuminerf.fields.surface import surface_cells
 from illuminerf.scene.images import write_png
@@ -96,8 +97,9 @@ def run(capture_path: Path, config: Config, out: Path) -> Path:
             radiance_field.surface, near_surface, config.mesh_resolution, config.min_component_share, cells
         )
         mesh.save_glb(out / "mesh.glb")
-        _save_previews(radiance_field, cells, views, config.num_previews, out / "normals")
-        scores = [_psnr(radiance_field, cells, views, view) for view in held_out]
+        shell = surface_shell(radiance_field.surface, cells)
+        _save_previews(radiance_field, shell, views, config.num_previews, out / "normals")
+        scores = [_psnr(radiance_field, shell, views, view) for view in held_out]
         metrics = {"fit_seconds": round(fit_seconds, 2), "beta": float(radiance_field.surface.beta.detach())}
         metrics |= {"num_faces": len(mesh.faces)}
         if scores:
@@ -125,9 +127,9 @@ def _fit(
     checkpoint: Path,
 ) -> None:
     device = hull.cells.device
-    pool = gather_rays(views.cameras[fitted], views.alpha[fitted], hull, device)
-    srgb = pool.values(views.premultiplied()[fitted])
-    alpha = pool.values(views.alpha[fitted]) if has_masks else None
+    pool = gather_rays(views.cameras[fitted], views.alphas(fitted), hull, device)
+    srgb = pool.values(views.premultiplied(fitted))
+    alpha = pool.values(views.alphas(fitted)) if has_masks else None
 
     def step_loss(step: int) -> tuple[torch.Tensor, dict[str, float]]:
         generator = torch_generator(config.seed, "geometry", step, device=device)
@@ -145,7 +147,7 @@ def _fit(
 def _bounds(views: Views, has_masks: bool, side: int, device: torch.device) -> OccupiedCells:
     if not has_masks:
         return OccupiedCells(torch.ones(side, side, side, dtype=torch.bool, device=device))
-    return OccupiedCells(visual_hull(views.cameras, views.alpha, side).to(device)).dilated(1)
+    return OccupiedCells(visual_hull(views.cameras, views.alphas(), side).to(device)).dilated(1)
 
 
 def _split(num_views: int, num_held_out: int) -> tuple[list[int], list[int]]:
@@ -157,17 +159,17 @@ def _split(num_views: int, num_held_out: int) -> tuple[list[int], list[int]]:
 
 
 def _save_previews(
-    radiance_field: RadianceField, cells: OccupiedCells, views: Views, num_previews: int, folder: Path
+    radiance_field: RadianceField, shell: SurfaceShell, views: Views, num_previews: int, folder: Path
 ) -> None:
     for number in range(min(num_previews, len(views))):
         view = number * len(views) // num_previews
-        image = render_image(radiance_field, cells, views.cameras, view)
+        image = render_image(radiance_field, shell, views.cameras, view)
         shown = np.clip(image.normals * 0.5 + 0.5 * image.alpha[..., None], 0, 1)
         write_png(folder / f"{view:03d}.png", np.dstack([shown, image.alpha]))
 
 
-def _psnr(radiance_field: RadianceField, cells: OccupiedCells, views: Views, view: int) -> float:
+def _psnr(radiance_field: RadianceField, shell: SurfaceShell, views: Views, view: int) -> float:
     """PSNR over the whole image, premultiplied on black."""
-    image = render_image(radiance_field, cells, views.cameras, view)
+    image = render_image(radiance_field, shell, views.cameras, view)
     target = views.srgb[view] * views.alpha[view][..., None]
     return float(-10 * np.log10(max(np.mean((np.clip(image.srgb, 0, 1) - target) ** 2), 1e-12)))

@@ -15,10 +15,11 @@ from illuminerf.fields.radiance_field import RadianceField
 from illuminerf.fields.ray_pool import RayPool, gather_rays
 from illuminerf.fields.shading_cache import ShadingCache, cache_shading, latent_loss
 from illuminerf.fields.storage import StoredField, load_field, save_field
-from illuminerf.scene.images import read_png, to_uint8
+from illuminerf.scene.images import read_png_bytes
 from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.device import resolve_device, torch_generator
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.progress import track
 
 _LEAST_COVERAGE = 0.5  # below it a pixel says little of the object's colour
 
@@ -94,13 +95,13 @@ def run(geometry_path: Path, capture_path: Path, relit_path: Path, config: Confi
             )
         views = load_capture(capture_path).views
         sample_views, num_samples = find_samples(relit_path, len(views))
-        alpha = views.alpha[sample_views]
-        least = _LEAST_COVERAGE if (alpha > _LEAST_COVERAGE).any() else 0.0
-        pool = gather_rays(views.cameras[sample_views], alpha, stored.cells, device, least)
+        is_opaque = any((alpha > _LEAST_COVERAGE).any() for alpha in views.alphas(sample_views))
+        least = _LEAST_COVERAGE if is_opaque else 0.0
+        pool = gather_rays(views.cameras[sample_views], views.alphas(sample_views), stored.cells, device, least)
         pool = pool.foreground_subset(config.max_rays, torch_generator(config.seed, "pixels", device=device))
         targets = _targets(relit_path, pool, sample_views, num_samples)
         cache = cache_shading(stored.field, pool, config.num_kept)
-        coverage = pool.values(alpha)
+        coverage = pool.values(views.alphas(sample_views))
         generator = torch_generator(config.seed, "latents")
         model = _LatentNerf(stored.field, len(sample_views) * num_samples, generator)
         psnr = _fit(model, stored.field, cache, pool, targets, coverage, config, out / "checkpoint.safetensors")
@@ -187,17 +188,16 @@ def _targets(relit_path: Path, pool: RayPool, views: list[int], num_samples: int
     height, width = pool.cameras.height, pool.cameras.width
     targets = torch.empty(num_samples, pool.num_foreground, 3, dtype=torch.uint8)
     of_ray, pixel = pool.view[: pool.num_foreground].cpu(), pool.pixel[: pool.num_foreground].cpu()
-    for number, view in enumerate(views):
+    for number, view in enumerate(track(views, "read samples")):
         rays = (of_ray == number).nonzero()[:, 0]
         for sample in range(num_samples):
             path = relit_path / "samples" / f"{view:03d}_{sample:02d}.png"
-            image = read_png(path)
+            image = read_png_bytes(path)
             if image.shape[:2] != (height, width):
                 raise UserError(
                     f"{path} has another size than the capture",
                     got=f"{image.shape[1]} x {image.shape[0]}",
                     wanted=f"{width} x {height}",
                 )
-            flat = torch.from_numpy(to_uint8(image[..., :3]).reshape(-1, 3))
-            targets[sample, rays] = flat[pixel[rays]]
+            targets[sample, rays] = torch.from_numpy(image.reshape(height * width, -1)[pixel[rays].numpy(), :3])
     return targets.to(pool.view.device)

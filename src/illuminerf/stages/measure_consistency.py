@@ -23,6 +23,7 @@ from illuminerf.evaluation.consistency import (
     squared_errors,
 )
 from illuminerf.fields.image_rendering import RenderedImage, render_image
+from illuminerf.fields.shell import SurfaceShell, surface_shell
 from illuminerf.fields.storage import StoredField, load_field
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.images import read_png
@@ -75,13 +76,12 @@ def run(capture: Path, relit: Path, latent_nerf: Path, config: Config, out: Path
             return out
         views = load_capture(capture).views
         stored = load_field(latent_nerf, resolve_device(config.device))
+        shell = surface_shell(stored.field.surface, stored.cells)
         pairs = neighbours(views.cameras, config.num_pairs)
         shown = sorted({view for pair in pairs for view in pair})
-        rendered = {
-            v: render_image(stored.field, stored.cells, views.cameras, v) for v in track(shown, "compare views")
-        }
+        rendered = {v: render_image(stored.field, shell, views.cameras, v) for v in track(shown, "compare views")}
         measured = _agreement(views, relit, rendered, pairs, config.tolerance)
-        measured |= _codes(stored, views.cameras, shown[: config.num_code_views], config.num_codes)
+        measured |= _codes(stored, shell, views.cameras, shown[: config.num_code_views], config.num_codes)
         write_json(out / "consistency.json", measured)
         artefact.finish(measured)
     return out
@@ -110,7 +110,9 @@ def _agreement(
     return summary | {"matches": num_matches, "pairs": len(pairs), "angle_radians": angle}
 
 
-def _codes(stored: StoredField, cameras: Cameras, shown: list[int], num_codes: int) -> dict[str, float | None]:
+def _codes(
+    stored: StoredField, shell: SurfaceShell, cameras: Cameras, shown: list[int], num_codes: int
+) -> dict[str, float | None]:
     """What the choice of a code changes; geometry is frozen, so that alpha shall not."""
     if stored.latents is None or not shown:
         return {"codes_alpha": None, "codes_colour": None}
@@ -118,9 +120,7 @@ def _codes(stored: StoredField, cameras: Cameras, shown: list[int], num_codes: i
     chosen = np.unique(np.linspace(0, count - 1, min(num_codes, count)).round().astype(int))
     alphas, colours = [], []
     for view in shown:
-        images = [
-            render_image(stored.field, stored.cells, cameras, view, stored.latents[int(index)]) for index in chosen
-        ]
+        images = [render_image(stored.field, shell, cameras, view, stored.latents[int(index)]) for index in chosen]
         mask = images[0].alpha > _COVERED
         alphas.append(mean_difference(np.stack([image.alpha for image in images]), np.ones_like(mask)))
         colours.append(mean_difference(np.stack([image.srgb for image in images]), mask))

@@ -1,12 +1,15 @@
 """LatentNerf + cameras -> NovelViews: images from new sides under the target light."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from illuminerf.fields.image_rendering import render_image
+from illuminerf.fields.image_rendering import RenderedImage, render_image, render_image_as_trained
+from illuminerf.fields.shell import surface_shell
 from illuminerf.fields.storage import StoredField, load_field
 from illuminerf.scene.cameras import Cameras, turntable_cameras
 from illuminerf.scene.images import linear_from_srgb, write_exr, write_png
@@ -15,6 +18,8 @@ from illuminerf.workflow.atomic import read_json, write_json
 from illuminerf.workflow.device import resolve_device
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import track
+
+_TRAINED_CHUNK = 8192  # samples as in training take far more memory per ray
 
 
 @dataclass(frozen=True)
@@ -44,8 +49,8 @@ class Config:
     latent_index: int | None = None
     """Which training image's latent code to render; None is the zero code, as in the paper's results."""
     num_samples: int | None = None
-    """Samples per ray; None is as in training."""
-    rays_per_chunk: int = 8192
+    """Samples per ray, placed as in training; None follows each ray through the surface, in fewer and finer steps."""
+    rays_per_chunk: int = 1 << 17
     """Rays at a time, which bounds memory."""
     device: str = "auto"
     """auto, cpu or cuda."""
@@ -78,13 +83,12 @@ def run(latent_nerf_path: Path, cameras_path: Path | None, config: Config, out: 
         if artefact.is_done:
             return out
         stored = load_field(latent_nerf_path, resolve_device(config.device))
-        if config.num_samples is not None:
-            stored.field.config = replace(stored.field.config, num_samples=config.num_samples)
+        render = _renderer(stored, config)
         latent = _latent(stored, config.latent_index)
         cameras = _cameras(cameras_path, config.turntable)
         for view in track(range(len(cameras)), "render novel views"):
             if not _paths(out, view)[1].exists():
-                _render_view(stored, cameras, view, latent, config.rays_per_chunk, out)
+                _write_view(render(cameras, view, latent), view, out)
         write_json(out / "cameras.json", cameras.to_dict())
         artefact.finish({"num_views": len(cameras)})
     return out
@@ -95,10 +99,19 @@ def _paths(out: Path, view: int) -> tuple[Path, Path]:
     return out / "images" / f"{view:03d}.png", out / "linear" / f"{view:03d}.exr"
 
 
-def _render_view(
-    stored: StoredField, cameras: Cameras, view: int, latent: torch.Tensor | None, chunk: int, out: Path
-) -> None:
-    image = render_image(stored.field, stored.cells, cameras, view, latent, chunk)
+def _renderer(stored: StoredField, config: Config) -> Callable[[Cameras, int, torch.Tensor | None], RenderedImage]:
+    chunk = config.rays_per_chunk
+    if config.num_samples is None:
+        shell = surface_shell(stored.field.surface, stored.cells)
+        return partial(render_image, stored.field, shell, chunk=chunk)
+    trained = stored.field.config
+    # what is left out must not grow with the number of samples
+    least = trained.min_weight * min(trained.num_samples / config.num_samples, 1)
+    stored.field.config = replace(trained, num_samples=config.num_samples, min_weight=least)
+    return partial(render_image_as_trained, stored.field, stored.cells, chunk=min(chunk, _TRAINED_CHUNK))
+
+
+def _write_view(image: RenderedImage, view: int, out: Path) -> None:
     alpha = image.alpha[..., None]
     straight = np.clip(np.where(alpha > 1e-3, image.srgb / np.maximum(alpha, 1e-3), 0), 0, 1)
     png, exr = _paths(out, view)

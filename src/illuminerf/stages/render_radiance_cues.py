@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from illuminerf.cues.renderer import CUE_CHANNELS, CueSampling, render_cues
-from illuminerf.data.capture import load_capture
+from illuminerf.data.capture import load_cameras
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import write_exr
 from illuminerf.scene.meshes import TriangleMesh
@@ -62,7 +62,7 @@ def run(geometry: Path, capture: Path, light: Path, config: Config, out: Path) -
         if artefact.is_done:
             return out
         placed = placed_light(light, config)
-        cameras = load_capture(capture).views.cameras
+        cameras = load_cameras(capture)
         mesh = TriangleMesh.load_glb(geometry / "mesh.glb")
         placed.save(out / "light.exr")
         write_json(

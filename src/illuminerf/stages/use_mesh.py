@@ -32,6 +32,7 @@ from illuminerf.fields.mesh_fit import (
 from illuminerf.fields.optimisation import OptimiserConfig, fit
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
 from illuminerf.fields.ray_pool import gather_rays
+from illuminerf.fields.shell import surface_shell
 from illuminerf.fields.storage import StoredField, save_field
 from illuminerf.fields.surface import surface_cells
 from illuminerf.scene.cameras import Cameras
@@ -193,7 +194,7 @@ def _fit_appearance(
     radiance_field: RadianceField, cells: OccupiedCells, views: Views, config: Config, checkpoint: Path
 ) -> None:
     device = cells.cells.device
-    pool = gather_rays(views.cameras, views.alpha, cells, device)
+    pool = gather_rays(views.cameras, views.alphas(), cells, device)
     srgb = pool.values(views.premultiplied())
     radiance_field.surface.requires_grad_(False)
 
@@ -206,6 +207,6 @@ def _fit_appearance(
 
 
 def _save_preview(radiance_field: RadianceField, cells: OccupiedCells, cameras: Cameras, view: int, out: Path) -> None:
-    image = render_image(radiance_field, cells, cameras, view)
+    image = render_image(radiance_field, surface_shell(radiance_field.surface, cells), cameras, view)
     shown = np.clip(image.normals * 0.5 + 0.5 * image.alpha[..., None], 0, 1)
     write_png(out / "normals" / f"{view:03d}.png", np.dstack([shown, image.alpha]))
