@@ -45,12 +45,9 @@ def _cell(positions, row, exists, axis: tl.constexpr, half, last):
 
 @triton.jit
 @no_type_check
-def _entry(x, y, z, resolution, offset, hash_mask, is_dense):
-    # 32 bits wrap, which leaves the low ones as they are in the twin's 64; the unused branch may hold anything
-    side = (resolution + 1).to(tl.uint32)
-    dense = x + side * (y + side * z)
-    hashed = (x ^ (y * 2654435761) ^ (z * 805459861)) & hash_mask.to(tl.uint32)
-    return offset.to(tl.int64) + tl.where(is_dense != 0, dense, hashed).to(tl.int64)
+def _level(levels, level):
+    row = levels + level * 4
+    return tl.load(row), tl.load(row + 1), tl.load(row + 2).to(tl.uint32), tl.load(row + 3) != 0
 
 
 @triton.jit(do_not_specialize=["num_points"])
@@ -68,8 +65,7 @@ def _forward(
     block: tl.constexpr,
 ):
     level = tl.program_id(1)
-    resolution, offset = tl.load(levels + level * 4), tl.load(levels + level * 4 + 1)
-    hash_mask, is_dense = tl.load(levels + level * 4 + 2), tl.load(levels + level * 4 + 3)
+    resolution, offset, hash_mask, is_dense = _level(levels, level)
     point = tl.program_id(0) * block + tl.arange(0, block)
     exists, row = point < num_points, point.to(tl.int64)
     half = resolution.to(table.dtype.element_ty) * 0.5
@@ -80,12 +76,18 @@ def _forward(
     kept = exists[:, None] & (feature < num_features)[None, :]
     value = tl.zeros((block, padded), table.dtype.element_ty)
     slope_x, slope_y, slope_z = value, value, value
+    # 32 bits wrap, which leaves the low ones as they are in the twin's 64
+    side, hash_y, hash_z = (resolution + 1).to(tl.uint32), y * 2654435761, z * 805459861
+    first = x + side * (y + side * z)
     for corner in tl.static_range(8):
         wx = fx if corner & 1 else 1 - fx
         wy = fy if corner & 2 else 1 - fy
         wz = fz if corner & 4 else 1 - fz
-        cx, cy, cz = x + (corner & 1), y + (corner & 2) // 2, z + corner // 4
-        entry = _entry(cx, cy, cz, resolution, offset, hash_mask, is_dense)
+        hashed = hash_y + 2654435761 if corner & 2 else hash_y
+        hashed ^= hash_z + 805459861 if corner & 4 else hash_z
+        hashed ^= x + 1 if corner & 1 else x
+        dense = first + side * ((corner & 2) // 2 + side * (corner // 4)) + (corner & 1)
+        entry = offset.to(tl.int64) + tl.where(is_dense, dense, hashed & hash_mask).to(tl.int64)
         stored = tl.load(table + entry[:, None] * num_features + feature[None, :], mask=kept, other=0.0)
         value += (wx * wy * wz)[:, None] * stored
         if with_jacobian:
@@ -121,8 +123,7 @@ def _backward(
     block: tl.constexpr,
 ):
     level = tl.program_id(1)
-    resolution, offset = tl.load(levels + level * 4), tl.load(levels + level * 4 + 1)
-    hash_mask, is_dense = tl.load(levels + level * 4 + 2), tl.load(levels + level * 4 + 3)
+    resolution, offset, hash_mask, is_dense = _level(levels, level)
     point = tl.program_id(0) * block + tl.arange(0, block)
     exists, row = point < num_points, point.to(tl.int64)
     half = resolution.to(table_grad.dtype.element_ty) * 0.5
@@ -140,12 +141,18 @@ def _backward(
         to_x = tl.load(start, mask=kept, other=0.0) * half
         to_y = tl.load(start + axis_stride, mask=kept, other=0.0) * half
         to_z = tl.load(start + 2 * axis_stride, mask=kept, other=0.0) * half
+    # 32 bits wrap, which leaves the low ones as they are in the twin's 64
+    side, hash_y, hash_z = (resolution + 1).to(tl.uint32), y * 2654435761, z * 805459861
+    first = x + side * (y + side * z)
     for corner in tl.static_range(8):
         wx = fx if corner & 1 else 1 - fx
         wy = fy if corner & 2 else 1 - fy
         wz = fz if corner & 4 else 1 - fz
-        cx, cy, cz = x + (corner & 1), y + (corner & 2) // 2, z + corner // 4
-        entry = _entry(cx, cy, cz, resolution, offset, hash_mask, is_dense)
+        hashed = hash_y + 2654435761 if corner & 2 else hash_y
+        hashed ^= hash_z + 805459861 if corner & 4 else hash_z
+        hashed ^= x + 1 if corner & 1 else x
+        dense = first + side * ((corner & 2) // 2 + side * (corner // 4)) + (corner & 1)
+        entry = offset.to(tl.int64) + tl.where(is_dense, dense, hashed & hash_mask).to(tl.int64)
         share = (wx * wy * wz)[:, None] * to_value
         if with_jacobian:
             share += (wy * wz if corner & 1 else -(wy * wz))[:, None] * to_x
@@ -203,7 +210,7 @@ def why_not(device: torch.device) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _levels(layout: bytes, device: torch.device) -> Tensor:
-    """`kernel_layout` in the form the kernels take: resolution, first entry, mask of the hash, whether stored densely."""
+    """`kernel_layout` in the form the kernels take: resolution, first entry, hash mask, stored densely or not."""
     rows = [
         [resolution, offset, size - 1, int((resolution + 1) ** 3 <= size)]
         for resolution, size, offset in np.frombuffer(layout, np.int64).reshape(-1, 3).tolist()

@@ -1,0 +1,100 @@
+"""The Triton kernels against the readable twin in float64, by Triton's interpreter where there is no GPU."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from illuminerf.fields import hash_grid
+from illuminerf.fields.hash_grid import HashGrid, interpolate
+from tests.fields.triton_cases import _OUTSIDE, CASES, Case, answers
+
+ROOT = Path(__file__).parents[2]
+KEYS = ("features", "jacobian", "first", "second", "features alone", "first of features alone")
+needs_triton = pytest.mark.skipif(
+    importlib.util.find_spec("triton") is None, reason="there is no triton (pip install triton; Linux only)"
+)
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Tensor]]:
+    """What the kernels answer, by case."""
+    out = tmp_path_factory.mktemp("triton") / "answers.safetensors"
+    environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}", "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(ROOT / "tests" / "fields" / "triton_cases.py"), str(out)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    tensors = load_file(out)
+    return {name: {key: tensors[f"{name}/{key}"] for key in KEYS} for name in CASES}
+
+
+def twin(grid: HashGrid, positions: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor]:
+    return interpolate(positions, grid.table, grid._resolutions, grid._sizes, grid._offsets, with_jacobian)
+
+
+def wanted(case: Case) -> dict[str, Tensor]:
+    return answers(case, torch.float64, twin)
+
+
+def errors(ours: dict[str, Tensor], theirs: dict[str, Tensor]) -> dict[str, float]:
+    """Largest difference over largest value."""
+    return {key: float((ours[key].double() - value).abs().max() / value.abs().max()) for key, value in theirs.items()}
+
+
+def tolerance(case: Case) -> float:
+    return 1e-13 if case.dtype == torch.float64 else 1e-5  # of 32 cells, a position has 2e-6
+
+
+@needs_triton
+@pytest.mark.parametrize("name", CASES)
+def test_kernels_equal_the_twin(found: dict[str, dict[str, Tensor]], name: str) -> None:
+    """Values, Jacobian, first derivatives and those of a loss on normals, which are of second order."""
+    for key, error in errors(found[name], wanted(CASES[name])).items():
+        assert error < tolerance(CASES[name]), key
+
+
+@needs_triton
+@pytest.mark.parametrize("name", CASES)
+def test_other_positions_are_noticed(found: dict[str, dict[str, Tensor]], name: str) -> None:
+    """The guard of the tolerance."""
+    case = CASES[name]
+    moved = Case(case.num_features, case.positions * 0.999, case.dtype)
+    for key, error in errors(found[name], wanted(moved)).items():
+        assert error > 100 * tolerance(case), key
+
+
+@needs_triton
+def test_another_hash_is_noticed_on_the_hashed_level_alone(
+    found: dict[str, dict[str, Tensor]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = "three features, odd borders"
+    monkeypatch.setattr(hash_grid, "_PRIMES", (1, 2654435761, 805459863))
+    ours, theirs = found[name]["features"], wanted(CASES[name])["features"]
+    torch.testing.assert_close(ours[:, :3], theirs[:, :3], rtol=0, atol=1e-12)
+    assert (ours[:, 3:] - theirs[:, 3:]).abs().max() > 0.1
+
+
+@needs_triton
+def test_points_outside_are_clamped_and_borders_belong_to_the_next_cell(found: dict[str, dict[str, Tensor]]) -> None:
+    name = "three features, odd borders"
+    case, ours = CASES[name], found[name]
+    inside = Case(3, _OUTSIDE.clamp(-1, 1))
+    for key in ("features", "jacobian"):
+        torch.testing.assert_close(ours[key][-3:], wanted(inside)[key], rtol=0, atol=1e-12)
+    # the guard: a hair before the border, in the cell before it, the Jacobian is another one
+    before = wanted(Case(3, case.positions.double() - 1e-12))["jacobian"]
+    assert (ours["jacobian"][20:34] - before[20:34]).abs().max() > 1
+
+
+def test_without_triton_the_twin_is_used_and_said_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert hash_grid._gpu_kernel.__wrapped__(torch.device("cuda")) is None
+    assert "pip install triton" in capsys.readouterr().err
