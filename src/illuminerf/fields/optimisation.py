@@ -112,7 +112,7 @@ def fit(
             if is_due and team.is_first:
                 tensors = {f"parameter.{name}": p for name, p in parameters.items()}
                 save_checkpoint(checkpoint, tensors | optimizer_tensors(optimiser), {"step": step + 1})
-            progress.advance(1, **numbers)
+            progress.advance(1, loss=total, **numbers)
 
 
 def _restore(checkpoint: Path, parameters: dict[str, nn.Parameter], optimiser: torch.optim.Optimizer) -> int:

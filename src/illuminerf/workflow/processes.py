@@ -83,7 +83,8 @@ class Team:
         if self.is_alone:
             return value
         weighted = value.detach().cpu() * self.weight(total)
-        distributed.all_reduce(weighted)
+        with _explained():
+            distributed.all_reduce(weighted)
         return weighted
 
     def counts(self, own: int) -> list[int]:
@@ -91,7 +92,8 @@ class Team:
         if self.is_alone:
             return [own]
         counts = [torch.zeros(1, dtype=torch.int64) for _ in range(self.count)]
-        distributed.all_gather(counts, torch.tensor([own]))
+        with _explained():
+            distributed.all_gather(counts, torch.tensor([own]))
         return [int(count) for count in counts]
 
     def agreed(self, finding: bool) -> bool:
@@ -103,19 +105,32 @@ class Team:
         if self.is_alone:
             return
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-        for work in [distributed.all_reduce(gradient, async_op=True) for gradient in gradients]:
-            work.wait()
+        with _explained():
+            for work in [distributed.all_reduce(gradient, async_op=True) for gradient in gradients]:
+                work.wait()
 
     def start_equal(self, tensors: Iterable[Tensor]) -> None:
         """Give every process the first one's values."""
         if self.is_alone:
             return
-        with torch.no_grad():
+        with torch.no_grad(), _explained():
             for tensor in tensors:
                 distributed.broadcast(tensor, 0)
 
 
 ALONE = Team()
+
+
+@contextmanager
+def _explained() -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:
+        raise UserError(
+            "another process of this run has ended, or does not answer",
+            got=str(error).splitlines()[0],
+            fix="start the same command again: it goes on from the last checkpoint",
+        ) from error
 
 
 def join(device: str) -> tuple[Team, torch.device]:
