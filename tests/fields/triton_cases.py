@@ -9,12 +9,14 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
+from illuminerf.fields.surface import SurfaceConfig, SurfaceField
 
 Interpolate = Callable[[HashGrid, Tensor, bool], tuple[Tensor, Tensor]]
 
@@ -66,6 +68,20 @@ def answers(case: Case, dtype: torch.dtype, interpolate: Interpolate) -> dict[st
     return {name: value.detach().contiguous() for name, value in found.items()}
 
 
+def eikonal_gradients(interpolate: Interpolate, weight: float = 1.0) -> dict[str, Tensor]:
+    """What an eikonal loss sends to the parameters of a surface, in float64, with the grid by `interpolate`."""
+    torch.manual_seed(6)
+    grid = HashGridConfig(2, 2, 7, 4, 32)
+    surface = SurfaceField(SurfaceConfig(grid=grid, hidden_width=8, normal_grid=grid)).double()
+    with torch.no_grad():
+        surface.grid.table.normal_(std=0.1)
+    with mock.patch.object(HashGrid, "_interpolated", interpolate):
+        point = surface(_inside(30).double(), torch.tensor([1.0, 0.5]))
+    loss = point.signed_distance.abs().mean() + weight * ((point.gradient.norm(dim=-1) - 1) ** 2).mean()
+    parameters = {"table": surface.grid.table, "first": surface.hidden.weight, "last": surface.head.weight}
+    return dict(zip(parameters, torch.autograd.grad(loss, list(parameters.values())), strict=True))
+
+
 def main(out: Path) -> None:
     from illuminerf.fields.hash_grid_triton import TritonInterpolation
 
@@ -78,6 +94,7 @@ def main(out: Path) -> None:
         for name, case in CASES.items()
         for key, value in answers(case, case.dtype, kernels).items()
     }
+    found |= {f"eikonal/{key}": value.contiguous() for key, value in eikonal_gradients(kernels).items()}
     save_file(found, out)
 
 
