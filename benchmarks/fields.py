@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from illuminerf.fields.bounds import OccupiedCells, ball_interval
 from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss
@@ -26,7 +27,7 @@ from illuminerf.fields.surface import SurfaceConfig, SurfaceField
 from illuminerf.scene.cameras import sphere_cameras
 from illuminerf.workflow.device import resolve_device, torch_generator
 
-_KERNEL_GRID = HashGridConfig(16, 2, 17, 16, 2048)
+KERNEL_GRID = HashGridConfig(16, 2, 17, 16, 2048)
 
 
 def seconds_per_call(call: Callable[[int], None], seconds: float, device: torch.device) -> float:
@@ -54,9 +55,7 @@ def sphere_pool(device: torch.device, size: int) -> RayPool:
     return gather_rays(cameras, np.stack(masks), OccupiedCells(grid.norm(dim=-1) < 0.65), device)
 
 
-def training_step(
-    parameters: list[torch.nn.Parameter], loss_of: Callable[[int], torch.Tensor]
-) -> Callable[[int], None]:
+def training_step(parameters: list[torch.nn.Parameter], loss_of: Callable[[int], Tensor]) -> Callable[[int], None]:
     """One step of Adam on `loss_of(step)`."""
     optimiser = torch.optim.Adam(parameters, lr=1e-4, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
@@ -78,7 +77,7 @@ def fits(config: FieldConfig, num_rays: int, seconds: float, device: torch.devic
     srgb = torch.full((len(pool), 3), 0.5, device=device)
     alpha = (torch.arange(len(pool), device=device) < pool.num_foreground).float()
 
-    def geometry(number: int) -> torch.Tensor:
+    def geometry(number: int) -> Tensor:
         generator = torch_generator(0, number, device=device)
         index = pool.draw(num_rays, generator)
         loss, _ = geometry_loss(field, GeometryLossConfig(), pool, srgb, alpha, index, 1.0, generator)
@@ -94,7 +93,7 @@ def fits(config: FieldConfig, num_rays: int, seconds: float, device: torch.devic
     codes = torch.nn.Parameter(torch.zeros(16, config.appearance.latent_width, device=device))
     batch = 2 * num_rays
 
-    def latent(number: int) -> torch.Tensor:
+    def latent(number: int) -> Tensor:
         generator = torch_generator(1, number, device=device)
         index = torch.randint(len(pool), (batch,), generator=generator, device=device)
         latents = torch.nn.functional.embedding(pool.view[index], codes)
@@ -106,47 +105,48 @@ def fits(config: FieldConfig, num_rays: int, seconds: float, device: torch.devic
 
 def kernel_against_twin(seconds: float, device: torch.device, num_points: int = 1 << 17) -> dict[str, float]:
     """Forward and backward of features and Jacobian at 16 levels: what the fields use on `device`, and its twin."""
-    grid = HashGrid(_KERNEL_GRID).to(device)
+    grid = HashGrid(KERNEL_GRID).to(device)
     positions = _random_positions(num_points, device)
 
-    def backward(features: torch.Tensor, jacobian: torch.Tensor) -> None:
+    def backward(features: Tensor, jacobian: Tensor) -> None:
         (features.sum() + jacobian.sum()).backward()
 
     def kernel(_: int) -> None:
         backward(*grid.with_jacobian(positions))
 
     def twin(_: int) -> None:
-        backward(*_readable(grid, positions))
+        backward(*readable(grid, positions))
 
     fast, slow = seconds_per_call(kernel, seconds, device), seconds_per_call(twin, seconds, device)
     return {"kernel_ms": 1e3 * fast, "twin_ms": 1e3 * slow, "twin_over_kernel": slow / fast}
 
 
-def surface_against_twin(seconds: float, num_points: int = 1 << 17) -> dict[str, float]:
-    """The same of the surface on a CPU under an eikonal loss, whose gradient is of second order."""
-    surface, device = SurfaceField(SurfaceConfig(grid=_KERNEL_GRID)), torch.device("cpu")
+def surface_against_twin(seconds: float, device: torch.device, num_points: int = 1 << 17) -> dict[str, float]:
+    """The same of the surface under an eikonal loss, whose gradient is of second order."""
+    surface = SurfaceField(SurfaceConfig(grid=KERNEL_GRID)).to(device)
     positions = _random_positions(num_points, device)
 
-    def backward(distance: torch.Tensor, gradient: torch.Tensor) -> None:
+    def backward(distance: Tensor, gradient: Tensor) -> None:
         (distance.abs().mean() + ((gradient.norm(dim=-1) - 1) ** 2).mean()).backward()
 
     def kernel(_: int) -> None:
         backward(*surface(positions))
 
     def twin(_: int) -> None:
-        backward(*surface.residual(*_readable(surface.grid, positions)))
+        backward(*surface.residual(*readable(surface.grid, positions)))
 
     fast, slow = seconds_per_call(kernel, seconds, device), seconds_per_call(twin, seconds, device)
     return {"surface_kernel_ms": 1e3 * fast, "surface_twin_ms": 1e3 * slow, "surface_twin_over_kernel": slow / fast}
 
 
-def _random_positions(num_points: int, device: torch.device) -> torch.Tensor:
+def _random_positions(num_points: int, device: torch.device) -> Tensor:
     return (torch.rand(num_points, 3, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9).to(device)
 
 
-def _readable(grid: HashGrid, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def readable(grid: HashGrid, positions: Tensor, with_jacobian: bool = True) -> tuple[Tensor, Tensor]:
+    """What the grid's kernels compute, in plain torch."""
     layout = (grid._resolutions, grid._sizes, grid._offsets)
-    return interpolate(positions, grid.table, *layout, with_jacobian=True)
+    return interpolate(positions, grid.table, *layout, with_jacobian=with_jacobian)
 
 
 def main() -> None:
@@ -167,7 +167,7 @@ def main() -> None:
     }
     result |= {name: round(value, 2) for name, value in fits(config, args.rays, args.seconds, device).items()}
     if device.type == "cpu":
-        ratios = kernel_against_twin(args.seconds, device) | surface_against_twin(args.seconds)
+        ratios = kernel_against_twin(args.seconds, device) | surface_against_twin(args.seconds, device)
         result |= {name: round(value, 2) for name, value in ratios.items()}
     print(json.dumps(result, indent=2))
 

@@ -33,10 +33,30 @@ def run(script: str, *arguments: str | Path, statuses: tuple[int, ...] = (0,)) -
 
 def test_kernels_agree_with_their_twins() -> None:
     report = run("check_kernels.py", "--tiny", "--device", "cpu")
-    assert report["passed"] and set(report["relative_errors_float64"]) == {
-        "features", "jacobian", "gradient", "second_order",
-    }  # fmt: skip
-    assert report["error_of_a_wrong_second_order"] > 1e6 * max(report["relative_errors_float64"].values())
+    errors = report["relative_errors"]["hash_grid float64"]
+    assert report["passed"] and set(errors) == {"features", "jacobian", "gradient", "second_order"}
+    assert report["of_a_wrong_second_order"]["hash_grid float64"] > 1e6 * max(errors.values())
+
+
+def test_fields_are_measured_beside_plain_torch() -> None:
+    report = run("../gpu_fields.py", "--tiny", "--device", "cpu")
+    assert report["passed"] and min(report["ceilings"].values()) > 0
+    for fit in ("geometry", "latent_nerf"):
+        assert report[fit]["minutes"].keys() == {"float32", "bfloat16", "float32_plain_torch"}
+        assert report[fit]["minutes"]["float32"] == pytest.approx(
+            25_000 / 60 / report[fit]["steps_per_second"]["float32"], rel=1e-3
+        )
+    for grid in (report["hash_grid"]["roofline"], report["hash_grid_of_the_surface"]):
+        assert 0 < grid["forward"]["least_gb"] < grid["forward_and_backward"]["least_gb"]
+    if "not_run" not in report["kernels"]:
+        assert max(report["kernels"]["relative_errors"]["triton float64"].values()) < 1e-9
+
+
+def test_without_a_gpu_the_fields_are_not_measured_and_it_is_said_why() -> None:
+    for device, said in (("cuda", "CUDA was asked for"), ("cpu", "this measures a GPU")):
+        command = [sys.executable, str(SCRIPTS.parent / "gpu_fields.py"), "--device", device]
+        done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"CUDA_VISIBLE_DEVICES": ""})
+        assert done.returncode == 1 and said in done.stderr and "Traceback" not in done.stderr
 
 
 @pytest.mark.slow
@@ -81,7 +101,7 @@ def test_speeds_stand_beside_ceilings(tmp_path: Path) -> None:
     capture = demo.bundled_capture()
     light = capture / "lights" / "evening.exr"
     where = ("--capture", capture, "--light", light, "--out", tmp_path / "run")
-    report = run("fields.py", "--tiny", "--device", "cpu", *where)
+    report = run("method.py", "--tiny", "--device", "cpu", *where)
     assert report["passed"] and min(report["ceilings"].values()) > 0 < report["geometry_floor_ms"]
     assert report["speed"]["geometry_rays_per_second"] > 0 < report["relighting_model"]["images_per_second"]["1"]
     assert {"geometry", "cues", "relit", "latent_nerf"} <= set(report["pipeline"]["seconds_by_stage"])

@@ -3,12 +3,13 @@
 import torch
 
 from illuminerf.fields.proposal_sampling import interlevel_loss, resample_edges, uniform_edges
+from illuminerf.fields.step_draws import StepDraws
 
 
 def test_uniform_edges_span_the_ray_in_order() -> None:
     near, far = torch.tensor([1.0, 2.0]), torch.tensor([2.0, 2.5])
     torch.testing.assert_close(uniform_edges(near, far, 4, None)[0], torch.linspace(1, 2, 5))
-    edges = uniform_edges(near, far, 16, torch.Generator().manual_seed(0))
+    edges = uniform_edges(near, far, 16, StepDraws(torch.Generator().manual_seed(0), len(near)))
     assert bool((edges[:, 1:] > edges[:, :-1]).all())
     torch.testing.assert_close(edges[:, 0], near)
     torch.testing.assert_close(edges[:, -1], far)
@@ -24,11 +25,11 @@ def test_samples_go_where_the_weight_is() -> None:
     edges = torch.linspace(0, 1, 11).expand(200, -1).contiguous()
     weights = torch.zeros(200, 10)
     weights[:, 6] = 1.0
-    new = resample_edges(edges, weights, 8, torch.Generator().manual_seed(0))
+    new = resample_edges(edges, weights, 8, StepDraws(torch.Generator().manual_seed(0), len(edges)))
     middles = 0.5 * (new[:, 1:] + new[:, :-1])
     inside = ((middles > 0.6) & (middles < 0.7)).float().mean()
     assert inside > 0.9
-    spread = resample_edges(edges, torch.ones(200, 10), 8, torch.Generator().manual_seed(0))
+    spread = resample_edges(edges, torch.ones(200, 10), 8, StepDraws(torch.Generator().manual_seed(0), len(edges)))
     middles = 0.5 * (spread[:, 1:] + spread[:, :-1])
     assert ((middles > 0.6) & (middles < 0.7)).float().mean() < 0.3
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from illuminerf.fields.directions import encode_directions, encoded_width, reflect
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
+from illuminerf.workflow.device import Precision, autocast
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class AppearanceField(nn.Module):
     def __init__(self, config: AppearanceConfig) -> None:
         super().__init__()
         self.config = config
+        self.precision: Precision = "float32"
         self.grid = HashGrid(config.grid)
         self.bottleneck = nn.Sequential(
             nn.Linear(config.grid.width, config.hidden_width),
@@ -90,19 +92,23 @@ class AppearanceField(nn.Module):
     ) -> Float[Tensor, "points 7"]:
         """Camera-view sRGB, reflected sRGB, raw blend weight; of one radiance field alone, it twice and 0. `latents`
         None stands for the zero code."""
-        bottleneck = self.bottleneck(self.grid(positions, level_weights))
-        if latents is not None and self.glo is not None:
-            bottleneck = self.glo(bottleneck, latents)
-        octaves = self.config.num_direction_octaves
-        mirrored = encode_directions(reflect(directions, normals), octaves)
-        radiance = []
-        if self.camera_radiance is not None:
-            seen = encode_directions(directions, octaves)
-            radiance.append(self.camera_radiance(torch.cat([positions, seen, normals, bottleneck], -1)))
-        if self.reflected_radiance is not None:
-            radiance.append(self.reflected_radiance(torch.cat([positions, mirrored, normals, bottleneck], -1)))
-        raw = torch.zeros_like(bottleneck[:, :1]) if self.blend is None else self.blend(bottleneck)
-        return torch.cat([torch.sigmoid(radiance[0]), torch.sigmoid(radiance[-1]), raw], -1)
+        features = self.grid(positions, level_weights)
+        with autocast(positions.device, self.precision):
+            bottleneck = self.bottleneck(features)
+            if latents is not None and self.glo is not None:
+                bottleneck = self.glo(bottleneck, latents)
+            octaves = self.config.num_direction_octaves
+            mirrored = encode_directions(reflect(directions, normals), octaves)
+            radiance = []
+            if self.camera_radiance is not None:
+                seen = encode_directions(directions, octaves)
+                radiance.append(self.camera_radiance(_joined(positions, seen, normals, bottleneck)))
+            if self.reflected_radiance is not None:
+                radiance.append(self.reflected_radiance(_joined(positions, mirrored, normals, bottleneck)))
+            raw = torch.zeros_like(bottleneck[:, :1]) if self.blend is None else self.blend(bottleneck)
+        # what is summed along rays and compared with photographs has the positions' digits
+        camera, reflected, raw = (part.to(positions.dtype) for part in (radiance[0], radiance[-1], raw))
+        return torch.cat([torch.sigmoid(camera), torch.sigmoid(reflected), raw], -1)
 
 
 def blend_radiance(rendered: Float[Tensor, "rays 7"]) -> Float[Tensor, "rays 3"]:
@@ -110,6 +116,12 @@ def blend_radiance(rendered: Float[Tensor, "rays 7"]) -> Float[Tensor, "rays 3"]
     camera, reflected, raw = rendered.split([3, 3, 1], -1)
     share = torch.sigmoid(raw)
     return share * reflected + (1 - share) * camera
+
+
+def _joined(positions: Tensor, directions: Tensor, normals: Tensor, bottleneck: Tensor) -> Tensor:
+    """The input of a radiance field in the bottleneck's precision: float32 would be copied twice."""
+    parts = [part.to(bottleneck.dtype) for part in (positions, directions, normals)]
+    return torch.cat([*parts, bottleneck], -1)
 
 
 def _radiance_mlp(width: int, config: AppearanceConfig) -> nn.Sequential:

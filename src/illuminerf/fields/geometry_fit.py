@@ -12,7 +12,9 @@ from illuminerf.fields.hash_grid import coarse_to_fine_weights
 from illuminerf.fields.proposal_sampling import interlevel_loss
 from illuminerf.fields.radiance_field import RadianceField
 from illuminerf.fields.ray_pool import RayPool
+from illuminerf.fields.step_draws import StepDraws
 from illuminerf.workflow.device import torch_generator
+from illuminerf.workflow.processes import ALONE, Team
 
 _HULL_MARGIN_CELLS = 1.9
 
@@ -51,15 +53,18 @@ def geometry_loss(
     index: Tensor,
     progress: float,
     generator: torch.Generator,
+    team: Team = ALONE,
 ) -> tuple[Tensor, dict[str, float]]:
-    """Loss of one batch of rays, with numbers to show.
+    """Loss of one batch of rays, or of the share of it that is this process's, with numbers to show.
 
     Args:
         target_srgb: premultiplied on black, of every ray of the pool.
         target_alpha: coverage; None where the capture has no masks.
-        index: the rays of this batch.
+        index: the rays of this batch, all processes' together.
         progress: share of the fit that is over.
     """
+    draws = StepDraws(generator, len(index), team)
+    batch, index = len(index), index[draws.own]
     device = index.device
     origins, directions, near, far = pool.rays(index)
     phase = progress / max(config.coarse_to_fine_share, 1e-6)
@@ -67,14 +72,14 @@ def geometry_loss(
     levels = coarse_to_fine_weights(grids.grid.num_levels, phase, config.first_levels, device)
     normal_levels = coarse_to_fine_weights(field.surface.num_normal_levels, phase, config.first_levels, device)
 
-    samples = field.sample(origins, directions, near, far, generator, levels)
+    samples = field.sample(origins, directions, near, far, draws, levels)
     points = field.worth_shading(samples)
     predicted, shading = field.shading_normals(points, normal_levels)
     srgb = field.shade(points, shading, directions)
 
-    noise = torch.randn(points.positions.shape, generator=generator, device=device) * config.smoothness_sigma
+    noise = draws.normal(len(points.positions), 3) * config.smoothness_sigma
     perturbed = field.surface.predicted_normals(points.positions + noise, normal_levels)
-    anywhere = torch.rand(len(index), 3, generator=generator, device=device) * 1.6 - 0.8
+    anywhere = draws.uniform(3) * 1.6 - 0.8
     gradients = torch.cat([samples.end_gradients.view(-1, 3), field.surface(anywhere, levels).gradient])
 
     # Charbonnier as in camp_zipnerf: against the squared error's ever smaller gradient the smoothness terms win
@@ -91,7 +96,7 @@ def geometry_loss(
     total = total + config.normal_smoothness * losses.normal_smoothness_loss(points.weights, predicted, perturbed, rays)
     if target_alpha is not None:
         total = total + config.mask * losses.mask_loss(samples.depth, target_alpha[index])
-    numbers = {"psnr": losses.psnr(squared), "beta": float(field.surface.beta.detach())}
+    numbers = {"psnr": losses.psnr(team.mean(squared, batch)), "beta": float(field.surface.beta.detach())}
     return total, numbers
 
 

@@ -2,10 +2,14 @@
 
 Features and Jacobian are both linear in the table, so a signed distance built on them has normals in forward mode,
 and losses on those normals train with ordinary first-order autograd: no double backward through positions.
-`interpolate` is the readable version and runs everywhere; on a CPU `HashGrid` uses the numba twin.
+`interpolate` is the readable version and runs everywhere. `HashGrid` uses its fast twins: on a CPU the one in numba; on
+a GPU, for float32 tables, the one in Triton, which PyTorch brings along there.
 """
 
+import functools
+import importlib.util
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -13,6 +17,7 @@ from torch import Tensor, nn
 
 from illuminerf.fields.hash_grid_kernel import KernelInterpolation, kernel_layout
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.progress import say
 
 _PRIMES = (1, 2654435761, 805459861)
 
@@ -74,29 +79,45 @@ class HashGrid(nn.Module):
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> Float[Tensor, "points width"]:
         """Features, each level times its weight (coarse to fine)."""
-        if positions.is_cuda or not len(positions):
-            features, _ = interpolate(positions, self.table, self._resolutions, self._sizes, self._offsets)
-        else:
-            features, _ = KernelInterpolation.apply(self.table, positions, self.layout, False)
+        features, _ = self._interpolated(positions, with_jacobian=False)
         return features if level_weights is None else features * self._columns(level_weights)
 
     def with_jacobian(
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> tuple[Float[Tensor, "points width"], Float[Tensor, "points width 3"]]:
         """Features and their derivatives with respect to the position."""
-        if positions.is_cuda or not len(positions):
-            features, jacobian = interpolate(
-                positions, self.table, self._resolutions, self._sizes, self._offsets, with_jacobian=True
-            )
-        else:
-            features, jacobian = KernelInterpolation.apply(self.table, positions, self.layout, True)
+        features, jacobian = self._interpolated(positions, with_jacobian=True)
         if level_weights is None:
             return features, jacobian
         columns = self._columns(level_weights)
         return features * columns, jacobian * columns[:, None]
 
+    def _interpolated(self, positions: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor]:
+        kernel: Any = KernelInterpolation
+        if positions.is_cuda:
+            kernel = _gpu_kernel(positions.device) if self.table.dtype == torch.float32 else None
+        if kernel is None or not len(positions):
+            levels = (self._resolutions, self._sizes, self._offsets)
+            return interpolate(positions, self.table, *levels, with_jacobian=with_jacobian)
+        return kernel.apply(self.table, positions, self.layout, with_jacobian)
+
     def _columns(self, level_weights: Tensor) -> Tensor:
         return level_weights.to(self.table).repeat_interleave(self.config.num_features)
+
+
+@functools.cache
+def _gpu_kernel(device: torch.device) -> Any:
+    """`TritonInterpolation`, or None where it cannot run; then the readable twin does."""
+    if importlib.util.find_spec("triton") is None:
+        reason = "there is no triton (pip install triton)"
+    else:
+        from illuminerf.fields.hash_grid_triton import TritonInterpolation, why_not
+
+        reason = why_not(device)
+        if not reason:
+            return TritonInterpolation
+    say(f"hash grids run many times slower than they could on {device}, without their kernels: {reason}")
+    return None
 
 
 def interpolate(

@@ -17,6 +17,7 @@ from illuminerf.fields.bounds import signed_distance_of_cells
 from illuminerf.fields.proposal_sampling import interlevel_loss
 from illuminerf.fields.radiance_field import RadianceField
 from illuminerf.fields.ray_pool import RayPool
+from illuminerf.fields.step_draws import StepDraws
 from illuminerf.fields.surface import SurfaceField
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.surfels import Surfels
@@ -203,7 +204,7 @@ def appearance_loss(
 ) -> tuple[Tensor, dict[str, float]]:
     """Colours of rays, and the proposal that finds the surface: what is left to fit where the surface is known."""
     origins, directions, near, far = pool.rays(index)
-    samples = field.sample(origins, directions, near, far, generator)
+    samples = field.sample(origins, directions, near, far, StepDraws(generator, len(index)))
     points = field.worth_shading(samples)
     _, normals = field.shading_normals(points)
     srgb = field.shade(points, normals, directions)

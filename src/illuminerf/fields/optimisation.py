@@ -1,4 +1,9 @@
-"""Adam as the paper sets it, and a loop that can be killed at any time and goes on to the same bytes."""
+"""Adam as the paper sets it, and a loop that can be killed at any time and goes on to the same bytes.
+
+Under torchrun the loop is run by a team of processes: each computes the loss of its share of a step's rays, weighed by
+the share's size, and gradients are added up before Adam. What comes out is what one process would have found, within
+rounding; with the same number of processes it is the same bytes again (on CPUs).
+"""
 
 import math
 from collections.abc import Callable
@@ -14,7 +19,9 @@ from illuminerf.workflow.checkpoint import (
     restore_optimizer,
     save_checkpoint,
 )
+from illuminerf.workflow.device import Precision
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.processes import ALONE, Team
 from illuminerf.workflow.progress import step_progress
 
 
@@ -34,6 +41,8 @@ class OptimiserConfig:
     """Steps of the cosine warm-up (500 of 25 000 in the paper)."""
     checkpoint_every: int = 500
     """Steps between checkpoints."""
+    precision: Precision = "float32"
+    """bfloat16: layers of the radiance fields in autocast; hash grids, signed distances and losses stay float32."""
 
     def __post_init__(self) -> None:
         if min(self.num_steps, self.rays_per_step, self.checkpoint_every) < 1 or self.warmup_steps < 0:
@@ -43,7 +52,7 @@ class OptimiserConfig:
 
     @classmethod
     def paper(cls) -> "OptimiserConfig":
-        """25 000 steps of 2^13 rays with 500 steps of warm-up."""
+        """25 000 steps of 2^13 rays (of all processes together) with 500 steps of warm-up."""
         return cls(num_steps=25_000, rays_per_step=8192, warmup_steps=500, checkpoint_every=1000)
 
     def learning_rate(self, step: int) -> float:
@@ -62,36 +71,48 @@ def fit(
     checkpoint: Path,
     description: str,
     start: Callable[[], None] | None = None,
+    team: Team = ALONE,
 ) -> None:
     """Minimise `step_loss` over the parameters of `module` that require a gradient.
 
     Args:
-        step_loss: from the step to the loss and numbers to show. All randomness must derive from the step, which is
-            what makes a resumed fit equal to an uninterrupted one.
+        step_loss: from the step to the loss (its mean over this process's share of the rays) and numbers to show. All
+            randomness must derive from the step, which is what makes a resumed fit equal to an uninterrupted one.
         checkpoint: where state is kept; the caller deletes it when the artefact is whole.
         start: called once before the first step, not on resume.
+        team: whose first process writes checkpoints.
+
+    Raises:
+        UserError: a step has fewer rays than there are processes.
     """
+    rays = config.rays_per_step
+    if rays < team.count:
+        raise UserError("a step needs a ray per process", got=f"{rays} rays, {team.count} processes")
     parameters = {name: p for name, p in module.named_parameters() if p.requires_grad}
     optimiser = torch.optim.Adam(list(parameters.values()), betas=(0.9, 0.99), eps=1e-15, fused=True)
     first = 0
-    if checkpoint.exists():
+    if team.agreed(checkpoint.exists()):
         first = _restore(checkpoint, parameters, optimiser)
     elif start is not None:
         start()
+    team.start_equal(parameters.values())
     with step_progress(description, config.num_steps, first) as progress:
         for step in range(first, config.num_steps):
             for group in optimiser.param_groups:
                 group["lr"] = config.learning_rate(step)
             loss, numbers = step_loss(step)
-            if not math.isfinite(float(loss.detach())):
-                raise FloatingPointError(f"the loss is {float(loss.detach())} at step {step} of {description}")
+            total = float(team.mean(loss.detach(), rays))
+            if not math.isfinite(total):
+                raise FloatingPointError(f"the loss is {total} at step {step} of {description}")
             optimiser.zero_grad(set_to_none=True)
-            loss.backward()
+            (loss if team.is_alone else loss * team.weight(rays)).backward()
+            team.sum_gradients(parameters.values())
             optimiser.step()
-            if (step + 1) % config.checkpoint_every == 0 and step + 1 < config.num_steps:
+            is_due = (step + 1) % config.checkpoint_every == 0 and step + 1 < config.num_steps
+            if is_due and team.is_first:
                 tensors = {f"parameter.{name}": p for name, p in parameters.items()}
                 save_checkpoint(checkpoint, tensors | optimizer_tensors(optimiser), {"step": step + 1})
-            progress.advance(1, **numbers)
+            progress.advance(1, loss=total, **numbers)
 
 
 def _restore(checkpoint: Path, parameters: dict[str, nn.Parameter], optimiser: torch.optim.Optimizer) -> int:

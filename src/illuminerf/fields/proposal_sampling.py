@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
+from illuminerf.fields.step_draws import StepDraws
 
 
 @dataclass(frozen=True)
@@ -43,12 +44,12 @@ def uniform_edges(
     near: Float[Tensor, " rays"],
     far: Float[Tensor, " rays"],
     num_samples: int,
-    generator: torch.Generator | None,
+    draws: StepDraws | None,
 ) -> Float[Tensor, "rays edges"]:
-    """Edges of `num_samples` even intervals; inner edges are jittered by up to half an interval with a generator."""
+    """Edges of `num_samples` even intervals; inner edges are jittered by up to half an interval with draws."""
     fractions = torch.linspace(0, 1, num_samples + 1, device=near.device).expand(len(near), -1)
-    if generator is not None:
-        jitter = torch.rand(len(near), num_samples - 1, generator=generator, device=near.device) - 0.5
+    if draws is not None:
+        jitter = draws.uniform(num_samples - 1) - 0.5
         fractions = fractions + functional.pad(jitter / num_samples, (1, 1))
     return near[:, None] + (far - near)[:, None] * fractions
 
@@ -57,7 +58,7 @@ def resample_edges(
     edges: Float[Tensor, "rays edges"],
     weights: Float[Tensor, "rays samples"],
     num_samples: int,
-    generator: torch.Generator | None,
+    draws: StepDraws | None,
     floor: float = 0.01,
 ) -> Float[Tensor, "rays new_edges"]:
     """Edges of `num_samples` intervals that split the mass of the histogram evenly (inverse CDF).
@@ -66,7 +67,7 @@ def resample_edges(
         edges: edges of the histogram, increasing.
         weights: its mass per interval; need not sum to one.
         num_samples: how many intervals come out.
-        generator: jitters the split points inside their strata; None takes the middles.
+        draws: jitter the split points inside their strata; None takes the middles.
         floor: mass spread evenly over the ray beforehand, as a share of one.
     """
     mass = weights.detach() + floor * (edges[:, 1:] - edges[:, :-1]) / (edges[:, -1:] - edges[:, :1])
@@ -74,11 +75,7 @@ def resample_edges(
     cdf = cdf / cdf[:, -1:]
     count = num_samples + 1
     strata = torch.arange(count, device=edges.device, dtype=edges.dtype).expand(len(edges), -1)
-    if generator is None:
-        targets = strata / num_samples
-    else:
-        offsets = torch.rand(len(edges), count, generator=generator, device=edges.device)
-        targets = (strata + offsets) / count
+    targets = strata / num_samples if draws is None else (strata + draws.uniform(count)) / count
     targets = targets.contiguous()
     above = torch.searchsorted(cdf.contiguous(), targets, right=True).clamp(1, edges.shape[1] - 1)
     low, high = cdf.gather(1, above - 1), cdf.gather(1, above)

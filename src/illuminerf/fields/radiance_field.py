@@ -1,5 +1,7 @@
 """UniSDF put together: proposal, surface and appearance, rendered along rays."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -11,8 +13,10 @@ from torch.nn import functional
 from illuminerf.fields.appearance import AppearanceConfig, AppearanceField, blend_radiance
 from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.proposal_sampling import ProposalConfig, ProposalField, resample_edges, uniform_edges
+from illuminerf.fields.step_draws import StepDraws
 from illuminerf.fields.surface import SurfaceConfig, SurfaceField
 from illuminerf.fields.volume_rendering import rendering_weights
+from illuminerf.workflow.device import Precision
 from illuminerf.workflow.errors import UserError
 
 
@@ -110,28 +114,37 @@ class RadianceField(nn.Module):
         self.surface = SurfaceField(config.surface)
         self.appearance = AppearanceField(config.appearance)
 
+    @contextmanager
+    def computing_in(self, precision: Precision) -> Iterator[None]:
+        """Inside, the layers of the radiance fields compute in this precision; all else stays float32."""
+        before, self.appearance.precision = self.appearance.precision, precision
+        try:
+            yield
+        finally:
+            self.appearance.precision = before
+
     def sample(
         self,
         origins: Float[Tensor, "rays 3"],
         directions: Float[Tensor, "rays 3"],
         near: Float[Tensor, " rays"],
         far: Float[Tensor, " rays"],
-        generator: torch.Generator | None = None,
+        draws: StepDraws | None = None,
         level_weights: Float[Tensor, " levels"] | None = None,
     ) -> RaySamples:
         """Choose intervals by the proposal, evaluate the surface at their ends and weigh them.
 
         Args:
-            generator: adds jitter; None is deterministic.
+            draws: add jitter; None is deterministic.
         """
         if self.proposal is None:
-            coarse = edges = uniform_edges(near, far, self.config.num_samples, generator)
+            coarse = edges = uniform_edges(near, far, self.config.num_samples, draws)
             proposal_weights = None
         else:
-            coarse = uniform_edges(near, far, self.config.num_proposal_samples, generator)
+            coarse = uniform_edges(near, far, self.config.num_proposal_samples, draws)
             density = self.proposal(_middles(origins, directions, coarse).view(-1, 3)).view(len(near), -1)
             proposal_weights = rendering_weights(density * (coarse[:, 1:] - coarse[:, :-1]))
-            edges = resample_edges(coarse, proposal_weights, self.config.num_samples, generator)
+            edges = resample_edges(coarse, proposal_weights, self.config.num_samples, draws)
         ends = origins[:, None] + edges[..., None] * directions[:, None]
         point = self.surface(ends.view(-1, 3), level_weights)
         distance, end_gradients = point.signed_distance.view_as(edges), point.gradient.view_as(ends)

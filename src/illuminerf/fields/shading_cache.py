@@ -13,6 +13,7 @@ from torch import Tensor
 from illuminerf.fields import losses
 from illuminerf.fields.radiance_field import RadianceField, ShadingPoints
 from illuminerf.fields.ray_pool import RayPool
+from illuminerf.workflow.processes import ALONE, Team
 from illuminerf.workflow.progress import track
 
 _CHUNK = 4096
@@ -91,13 +92,18 @@ def latent_loss(
     target_srgb: Float[Tensor, "batch 3"],
     latents: Float[Tensor, "batch latent"] | None,
     latent_penalty: float,
+    team: Team = ALONE,
+    batch: int = 0,
 ) -> tuple[Tensor, dict[str, float]]:
-    """Equation 7 of the paper on one batch.
+    """Equation 7 of the paper on one batch, or on a process's share of it.
 
     Deviation: a small penalty on the squared latents keeps the zero code, which is rendered at test, in their midst.
+
+    Args:
+        batch: rays of all processes together.
     """
     colour = losses.colour_loss(cache.render(field, index, latents), target_srgb)
     total = colour
     if latents is not None:
         total = total + latent_penalty * latents.square().sum(-1).mean()
-    return total, {"psnr": losses.psnr(colour.detach())}
+    return total, {"psnr": losses.psnr(team.mean(colour.detach(), batch))}

@@ -1,4 +1,9 @@
-"""Capture -> Geometry: a signed distance field fitted to the images, and its mesh with predicted normals."""
+"""Capture -> Geometry: a signed distance field fitted to the images, and its mesh with predicted normals.
+
+On several GPUs (or, through gloo, several CPU processes), which share the rays of every step and the folder:
+
+    torchrun --nproc-per-node 8 -m illuminerf estimate-geometry CAPTURE --out GEOMETRY
+"""
 
 import time
 from dataclasses import dataclass, field
@@ -20,9 +25,9 @@ from illuminerf.fields.storage import StoredField, save_field
 from illuminerf.fields.surface import surface_cells
 from illuminerf.scene.images import write_png
 from illuminerf.scene.views import Views
-from illuminerf.workflow.artefact import open_artefact
-from illuminerf.workflow.device import derived_seed, resolve_device, torch_generator
+from illuminerf.workflow.device import derived_seed, torch_generator
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.processes import Team, join, open_together
 from illuminerf.workflow.progress import say
 
 
@@ -76,17 +81,19 @@ class Config:
 
 def run(capture_path: Path, config: Config, out: Path) -> Path:
     """Fit the geometry of a capture; see the module's docstring."""
-    with open_artefact(out, "estimate_geometry", config, {"capture": capture_path}) as artefact:
+    team, device = join(config.device)
+    with open_together(team, out, "estimate_geometry", config, {"capture": capture_path}) as artefact:
         if artefact.is_done:
             return out
         start = time.monotonic()
-        device = resolve_device(config.device)
         capture = load_capture(capture_path)
         views, has_masks = capture.views, capture.background == "masked"
         fitted, held_out = _split(len(views), config.num_held_out_views)
         hull = _bounds(views, has_masks, config.occupancy_side, device)
         radiance_field = new_field(config.radiance_field, config.seed, device)
-        _fit(radiance_field, hull, views, fitted, has_masks, config, out / "checkpoint.safetensors")
+        _fit(radiance_field, hull, views, fitted, has_masks, config, out / "checkpoint.safetensors", team)
+        if not team.is_first:
+            return out
         fit_seconds = time.monotonic() - start
 
         near_surface = surface_cells(radiance_field.surface, hull)
@@ -125,6 +132,7 @@ def _fit(
     has_masks: bool,
     config: Config,
     checkpoint: Path,
+    team: Team,
 ) -> None:
     device = hull.cells.device
     pool = gather_rays(views.cameras[fitted], views.alphas(fitted), hull, device)
@@ -135,13 +143,14 @@ def _fit(
         generator = torch_generator(config.seed, "geometry", step, device=device)
         index = pool.draw(config.optimiser.rays_per_step, generator)
         progress = step / config.optimiser.num_steps
-        return geometry_loss(radiance_field, config.losses, pool, srgb, alpha, index, progress, generator)
+        return geometry_loss(radiance_field, config.losses, pool, srgb, alpha, index, progress, generator, team)
 
     def start() -> None:
         if config.losses.starts_from_hull:
             start_from_cells(radiance_field, hull, config.losses.first_levels, config.seed)
 
-    fit(radiance_field, config.optimiser, step_loss, checkpoint, "fit geometry", start)
+    with radiance_field.computing_in(config.optimiser.precision):
+        fit(radiance_field, config.optimiser, step_loss, checkpoint, "fit geometry", start, team)
 
 
 def _bounds(views: Views, has_masks: bool, side: int, device: torch.device) -> OccupiedCells:

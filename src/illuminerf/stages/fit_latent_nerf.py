@@ -1,4 +1,9 @@
-"""RelitViews + Geometry -> LatentNerf: one 3D appearance that explains all relit samples through latent codes."""
+"""RelitViews + Geometry -> LatentNerf: one 3D appearance that explains all relit samples through latent codes.
+
+On several GPUs (or, through gloo, several CPU processes), which share the rays of every step and the folder:
+
+    torchrun --nproc-per-node 8 -m illuminerf fit-latent-nerf GEOMETRY CAPTURE RELIT --out LATENT_NERF
+"""
 
 import re
 from dataclasses import dataclass, field
@@ -16,9 +21,9 @@ from illuminerf.fields.ray_pool import RayPool, gather_rays
 from illuminerf.fields.shading_cache import ShadingCache, cache_shading, latent_loss
 from illuminerf.fields.storage import StoredField, load_field, save_field
 from illuminerf.scene.images import read_png_bytes
-from illuminerf.workflow.artefact import open_artefact
-from illuminerf.workflow.device import resolve_device, torch_generator
+from illuminerf.workflow.device import torch_generator
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.processes import Team, join, open_together
 from illuminerf.workflow.progress import track
 
 _LEAST_COVERAGE = 0.5  # below it a pixel says little of the object's colour
@@ -82,10 +87,10 @@ def run(geometry_path: Path, capture_path: Path, relit_path: Path, config: Confi
         "capture": capture_path,
         "relit": relit_path,
     }
-    with open_artefact(out, "fit_latent_nerf", config, inputs) as artefact:
+    team, device = join(config.device)
+    with open_together(team, out, "fit_latent_nerf", config, inputs) as artefact:
         if artefact.is_done:
             return out
-        device = resolve_device(config.device)
         stored = load_field(geometry_path, device)
         if config.use_latents and stored.field.config.appearance.latent_width < 1:
             raise UserError(
@@ -104,7 +109,9 @@ def run(geometry_path: Path, capture_path: Path, relit_path: Path, config: Confi
         coverage = pool.values(views.alphas(sample_views))
         generator = torch_generator(config.seed, "latents")
         model = _LatentNerf(stored.field, len(sample_views) * num_samples, generator)
-        psnr = _fit(model, stored.field, cache, pool, targets, coverage, config, out / "checkpoint.safetensors")
+        psnr = _fit(model, stored.field, cache, pool, targets, coverage, config, out / "checkpoint.safetensors", team)
+        if not team.is_first:
+            return out
         latents = model.latents.detach() if config.use_latents else None
         save_field(out, StoredField(stored.field, stored.cells, latents))
         (out / "checkpoint.safetensors").unlink(missing_ok=True)
@@ -151,6 +158,7 @@ def _fit(
     coverage: Float[Tensor, " rays"],
     config: Config,
     checkpoint: Path,
+    team: Team,
 ) -> float:
     """Optimise; returns the PSNR over the last steps.
 
@@ -158,28 +166,30 @@ def _fit(
     that makes up for too much opacity: targets over black are brought from the mask's coverage to the surface's.
     """
     device = cache.weights.device
-    num_samples, recent = len(targets), [0.0]
+    num_samples, recent, rays = len(targets), [0.0], config.optimiser.rays_per_step
+    own = team.own(rays)
     to_opacity = (cache.weights.sum(-1) / coverage.clamp_min(1e-3))[:, None]
 
     def step_loss(step: int) -> tuple[Tensor, dict[str, float]]:
         generator = torch_generator(config.seed, "latent nerf", step, device=device)
-        size = (config.optimiser.rays_per_step,)
-        index = torch.randint(pool.num_foreground, size, generator=generator, device=device)
-        sample = torch.randint(num_samples, size, generator=generator, device=device)
+        index = torch.randint(pool.num_foreground, (rays,), generator=generator, device=device)[own]
+        sample = torch.randint(num_samples, (rays,), generator=generator, device=device)[own]
         target = (targets[sample, index].float() / 255 * to_opacity[index]).clamp_max(1)
         latents = None
         if config.use_latents:
             image = pool.view[index] * num_samples + sample
             if config.shuffles_latents:
-                others = torch.randint(max(len(model.latents) - 1, 1), size, generator=generator, device=device)
-                image = (image + 1 + others) % len(model.latents)
+                others = torch.randint(max(len(model.latents) - 1, 1), (rays,), generator=generator, device=device)
+                image = (image + 1 + others[own]) % len(model.latents)
             latents = functional.embedding(image, model.latents)
-        loss, numbers = latent_loss(radiance_field, cache, index, target, latents, config.latent_penalty)
+        penalty = config.latent_penalty
+        loss, numbers = latent_loss(radiance_field, cache, index, target, latents, penalty, team, rays)
         share = 0.98 if step else 0.0
         recent[0] = share * recent[0] + (1 - share) * numbers["psnr"]
         return loss, {"psnr": recent[0]}
 
-    fit(model, config.optimiser, step_loss, checkpoint, "fit latent NeRF")
+    with radiance_field.computing_in(config.optimiser.precision):
+        fit(model, config.optimiser, step_loss, checkpoint, "fit latent NeRF", team=team)
     return recent[0]
 
 

@@ -203,7 +203,8 @@ def _fit_appearance(
         index = pool.draw(config.optimiser.rays_per_step, generator)
         return appearance_loss(radiance_field, pool, srgb, index, generator)
 
-    fit(_OnSurface(radiance_field), config.optimiser, step_loss, checkpoint, "fit appearance")
+    with radiance_field.computing_in(config.optimiser.precision):
+        fit(_OnSurface(radiance_field), config.optimiser, step_loss, checkpoint, "fit appearance")
 
 
 def _save_preview(radiance_field: RadianceField, cells: OccupiedCells, cameras: Cameras, view: int, out: Path) -> None:

@@ -29,7 +29,7 @@ class StepProgress:
         self._start, self._first = time.monotonic(), completed
         self._last_line = self._start
         self._bar: Progress | None = None
-        if console.is_terminal and console.width >= 40:
+        if console.is_terminal and not console.quiet and console.width >= 40:
             narrow = console.width < 100
             columns = [
                 TextColumn("{task.description}", markup=False),
@@ -48,6 +48,8 @@ class StepProgress:
             self._bar.update(self._task, completed=self.completed, note=note)
             return
         now = time.monotonic()
+        if console.quiet:
+            return
         if now - self._last_line >= _LOG_EVERY_SECONDS or self.completed == self.total:
             self._last_line = now
             rate = (self.completed - self._first) / max(now - self._start, 1e-9)
@@ -75,6 +77,11 @@ def track(iterable: Iterable[Item], description: str, total: int | None = None) 
         for item in iterable:
             yield item
             progress.advance()
+
+
+def be_quiet() -> None:
+    """Show nothing from now on: another process speaks for all."""
+    console.quiet = True
 
 
 def say(message: str, *, markup: bool = False) -> None:

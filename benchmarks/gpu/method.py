@@ -1,6 +1,6 @@
 """How fast both fields and the relighting model are on this device, beside what the device could do; prints JSON.
 
-python benchmarks/gpu/fields.py [--device auto] [--preset paper] [--seconds 20] [--rays 8192]
+python benchmarks/gpu/method.py [--device auto] [--preset paper] [--seconds 20] [--rays 8192]
     [--capture FOLDER --light LIGHT.exr --out RUN] [--tiny]
 
 Ceilings are measured, not looked up: copying large arrays, and multiplying large matrices. The floor of a step is the
@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument("--capture", type=Path)
     parser.add_argument("--light", type=Path)
     parser.add_argument("--cue-device", default="cpu", choices=("auto", "cpu", "cuda"))
-    parser.add_argument("--out", type=Path, default=Path("runs/gpu_fields"))
+    parser.add_argument("--out", type=Path, default=Path("runs/gpu_method"))
     parser.add_argument("--tiny", action="store_true", help="small grids, few rays, a second for everything")
     options = parser.parse_args()
     device = resolve_device(options.device)
