@@ -24,7 +24,7 @@ _LIGHT = "light.data"
 
 
 class DifferentiableShading:
-    """A mesh in a principled material with values per vertex, under an environment map; `cues.shading` renders the same.
+    """A mesh in a principled material with values per vertex, under a light; `cues.shading` renders the same.
 
     Args:
         mesh: the object in the world of the rays.
@@ -153,7 +153,8 @@ class DifferentiableShading:
         that, and a kernel that reads it is compiled for its alignment."""
         dr, mi = self._dr, self._mi
         flat = mi.Float(np.ascontiguousarray(values.detach().cpu().numpy(), np.float32).ravel())
-        return dr.gather(kind, flat, dr.arange(mi.UInt32, len(values) * samples) // samples)
+        # opaque too, or there is one kernel for each number of samples
+        return dr.gather(kind, flat, dr.arange(mi.UInt32, len(values) * samples) // dr.opaque(mi.UInt32, samples))
 
     def _sampled(self, mode: Any, sampler: Any, ray: Any, by_radiance: Any, state: Any) -> Any:
         return self._integrator.sample(
@@ -185,7 +186,7 @@ class _Radiance(torch.autograd.Function):
         return found.to(base_color.device), hit.to(base_color.device)
 
     @staticmethod
-    def backward(ctx: Any, by_radiance: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, by_radiance: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         shading, rays, samples, seed = ctx.call
         found = shading.gradients(ctx.saved_tensors, by_radiance, rays, samples, derived_seed(seed, "gradient"))
         return (*found, None, None, None, None)

@@ -5,6 +5,7 @@ shape is given. Values per vertex are sums over grids of several resolutions, so
 filled in from around, and roughness and metalness, of which photographs tell little, have coarse grids only.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,8 +92,7 @@ class FittedMaterials(nn.Module):
 
     def values(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Base colour [vertices, 3], roughness [vertices], metallic [vertices] and the light's radiance."""
-        color = sum(grid(values) for grid, values in zip(self._color, self.color_grids, strict=True))
-        surface = sum(grid(values) for grid, values in zip(self._surface, self.surface_grids, strict=True))
+        color, surface = _summed(self._color, self.color_grids), _summed(self._surface, self.surface_grids)
         config = self._config
         rough = (config.first_roughness - _SMOOTHEST) / (1 - _SMOOTHEST)
         first = torch.logit(torch.tensor([rough, config.first_metallic]))
@@ -194,6 +194,10 @@ class _Interpolation:
         return _Interpolated.apply(values, self)
 
 
+def _summed(grids: Sequence[_Interpolation], values: Iterable[Tensor]) -> Tensor:
+    return torch.stack([grid(value) for grid, value in zip(grids, values, strict=True)]).sum(0)
+
+
 class _Interpolated(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, grid: _Interpolation) -> Tensor:  # type: ignore[override]
@@ -201,7 +205,7 @@ class _Interpolated(torch.autograd.Function):
         return torch.from_numpy(grid.matrix @ values.detach().numpy())
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         return torch.from_numpy(ctx.grid.transposed @ gradient.numpy()), None
 
 

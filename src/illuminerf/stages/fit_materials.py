@@ -39,7 +39,7 @@ class Config:
 
     optimiser: OptimiserConfig = field(
         default_factory=lambda: OptimiserConfig(
-            num_steps=800,
+            num_steps=400,
             rays_per_step=4096,
             first_learning_rate=2e-2,
             last_learning_rate=2e-3,
@@ -52,6 +52,19 @@ class Config:
     """Grids, paths and priors."""
     seed: int = 0
     """Of pixels and paths."""
+
+    @classmethod
+    def fine(cls) -> "Config":
+        """For large photographs and a GPU."""
+        steps = OptimiserConfig(
+            num_steps=3000,
+            rays_per_step=65_536,
+            first_learning_rate=2e-2,
+            last_learning_rate=1e-3,
+            warmup_steps=60,
+        )
+        sides = (8, 16, 32, 64, 128, 256, 512)
+        return cls(steps, MaterialFit(map_height=32, color_sides=sides, samples_per_ray=16))
 
 
 def run(geometry: Path, capture: Path, illumination: Path | None, config: Config, out: Path) -> Path:
