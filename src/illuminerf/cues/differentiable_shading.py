@@ -167,7 +167,7 @@ class _Radiance(torch.autograd.Function):
     """`DifferentiableShading.radiance` of a padded light."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         base_color: Tensor,
         roughness: Tensor,

@@ -52,7 +52,7 @@ class MaterialFit:
     """Error, in sRGB values, from which on it counts linearly and no longer squared."""
     light_smoothness: float = 0.003
     """Weight of the squared differences of log radiance between neighbouring texels."""
-    color_roughness: float = 0.003
+    color_detail: float = 0.003
     """Weight of the squared values of the grids of base colour, times their side over the coarsest one's."""
     surface_change: float = 0.001
     """Weight of the squared changes of roughness and metallic, in logits."""
@@ -66,7 +66,7 @@ class MaterialFit:
             raise UserError("the fit of materials needs grids", wanted="sides of 1 or more")
         if not all(0 < value < 1 for value in (self.first_metallic, self.first_roughness - _SMOOTHEST)):
             raise UserError("the fit of materials starts outside (0, 1)", got=str(self))
-        weights = (self.light_smoothness, self.color_roughness, self.surface_change)
+        weights = (self.light_smoothness, self.color_detail, self.surface_change)
         if min(weights) < 0 or not self.robustness > 0:
             raise UserError("weights of the fit of materials must not be negative", got=str(self))
 
@@ -107,7 +107,7 @@ class FittedMaterials(nn.Module):
         surface = sum(values.square().mean() for values in self.surface_grids)
         return (
             config.light_smoothness * _unevenness(self.log_light)
-            + config.color_roughness * color
+            + config.color_detail * color
             + config.surface_change * surface
         )
 
@@ -200,7 +200,7 @@ def _summed(grids: Sequence[_Interpolation], values: Iterable[Tensor]) -> Tensor
 
 class _Interpolated(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, values: Tensor, grid: _Interpolation) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, values: Tensor, grid: _Interpolation) -> Tensor:
         ctx.grid = grid
         return torch.from_numpy(grid.matrix @ values.detach().numpy())
 
