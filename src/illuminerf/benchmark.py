@@ -86,6 +86,8 @@ def tensoir_command(
     if out is None or lights_dir is None:
         raise UserError("nothing to run or score", fix="give --out and --lights-dir to run the method, or --score")
     settings = customised(preset, samples=samples, size=size, seed=seed, device=device)
+    if baseline is not None:
+        inverse_rendering.check(settings)
     for scene in scenes:
         names, jobs = relight_scene(root / scene, lights, lights_dir, settings, size, every, out)
         if baseline is not None:

@@ -8,12 +8,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from illuminerf import pipeline
+from illuminerf.cues.differentiable_shading import mitsuba_with_gradients
 from illuminerf.presets import Preset
 from illuminerf.stages import fit_materials, render_materials
 from illuminerf.workflow.artefact import read_metrics
 
 NAME = "inverse rendering"
 _SHARED = ("capture", "geometry", "illumination")
+
+
+def check(preset: Preset) -> None:
+    """Raise a UserError where this machine cannot do it, before hours are spent on the method's own run."""
+    mitsuba_with_gradients(preset.materials.fit.device)
 
 
 def relight(run: Path, jobs: Sequence[pipeline.LightJob], preset: Preset, out: Path) -> dict[str, Path]:

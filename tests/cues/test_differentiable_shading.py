@@ -1,10 +1,13 @@
 """Values against the renderer that relights, gradients against differences, and the fit's grids against a plane."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from illuminerf.cues import differentiable_shading
 from illuminerf.cues.differentiable_shading import DifferentiableShading
 from illuminerf.cues.material_fit import FittedMaterials, MaterialFit, _Interpolation, photometric_loss
 from illuminerf.cues.materials import Material
@@ -131,7 +134,11 @@ def test_the_prior_wants_a_smooth_grey_light() -> None:
     assert priors[0] == pytest.approx(0, abs=1e-9) and min(priors[1:]) > 1e-4
 
 
-def test_what_cannot_be_is_refused() -> None:
+def test_what_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    scalar = SimpleNamespace(variant=lambda: "scalar_rgb")
+    monkeypatch.setattr(differentiable_shading, "load_mitsuba", lambda device: scalar)
+    with pytest.raises(UserError, match="libLLVM"):
+        DifferentiableShading(MESH, HEIGHT, 3)
     with pytest.raises(UserError, match="light"):
         MaterialFit(map_height=2)
     with pytest.raises(UserError, match="grids"):

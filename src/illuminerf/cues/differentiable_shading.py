@@ -7,6 +7,7 @@ is what the gradient of a squared error needs, then has no bias (with the same n
 
 import importlib
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,23 @@ _ATTRIBUTES = {"vertex_color": 3, "vertex_roughness": 1, "vertex_metallic": 1}
 _LIGHT = "light.data"
 
 
+def mitsuba_with_gradients(device: str) -> ModuleType:
+    """Mitsuba in a variant that differentiates.
+
+    Raises:
+        UserError: only the one without gradients runs here.
+    """
+    mitsuba = load_mitsuba(device)
+    if mitsuba.variant().startswith("scalar"):
+        raise UserError(
+            "inverse rendering needs a path tracer with gradients",
+            got=f"Mitsuba's {mitsuba.variant()}",
+            wanted="libLLVM 19 or newer, or --device cuda",
+            fix="apt install libllvm19 (Debian, Ubuntu), or name a library in DRJIT_LIBLLVM_PATH",
+        )
+    return mitsuba
+
+
 class DifferentiableShading:
     """A mesh in a principled material with values per vertex, under a light; `cues.shading` renders the same.
 
@@ -37,14 +55,7 @@ class DifferentiableShading:
     """
 
     def __init__(self, mesh: TriangleMesh, map_height: int, max_depth: int, device: str = "auto") -> None:
-        self._mi = mi = load_mitsuba(device)
-        if mi.variant().startswith("scalar"):
-            raise UserError(
-                "inverse rendering needs a path tracer with gradients",
-                got=f"Mitsuba's {mi.variant()}",
-                wanted="libLLVM 19 or newer, or --device cuda",
-                fix="apt install libllvm19 (Debian, Ubuntu), or name a library in DRJIT_LIBLLVM_PATH",
-            )
+        self._mi = mi = mitsuba_with_gradients(device)
         self._dr: Any = importlib.import_module("drjit")
         values = {name: np.full((len(mesh.vertices), width), 0.5) for name, width in _ATTRIBUTES.items()}
         sources = [{"type": "mesh_attribute", "name": name} for name in _ATTRIBUTES]
