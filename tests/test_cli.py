@@ -106,7 +106,10 @@ def test_another_programs_folder_is_left_alone(
 
 
 def test_benchmark_asks_for_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "--score" in refused(["benchmark", "tensoir", str(tmp_path), "--scenes", "hotdog"], capsys)
+    command = ["benchmark", "tensoir", str(tmp_path), "--scenes", "hotdog"]
+    assert "--score" in refused(command, capsys)
+    both = [*command, "--score", str(tmp_path), "--baseline", "inverse-rendering"]
+    assert "a baseline needs a run" in refused(both, capsys)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import tyro
 from rich.table import Table
 
-from illuminerf import pipeline
+from illuminerf import inverse_rendering, pipeline
 from illuminerf.data.tensoir import load_test_cameras
 from illuminerf.diffusion.pretrained import pretrained_model
 from illuminerf.diffusion.relighting_scores import evaluate, held_out_pairs
@@ -15,9 +15,9 @@ from illuminerf.diffusion.sampling import Sampler
 from illuminerf.diffusion.training_items import load_items
 from illuminerf.evaluation.latex_tables import latex_tables
 from illuminerf.evaluation.pictures import CellPictures
-from illuminerf.evaluation.score_files import FILE_NAME, MethodScores, all_cells, read_score_files
+from illuminerf.evaluation.score_files import BASELINE_FOLDER, FILE_NAME, MethodScores, all_cells, read_score_files
 from illuminerf.evaluation.score_report import score_page
-from illuminerf.evaluation.tables import cell_table, published_table
+from illuminerf.evaluation.tables import MeanRow, cell_table, published_table
 from illuminerf.presets import DILIGHTNET, EMBEDDED, Preset, customised
 from illuminerf.stages.compare_renderings import RenderedMethod, compare_renderings
 from illuminerf.stages.score_predictions import score_input_light, score_predictions, write_predictions
@@ -55,6 +55,7 @@ def tensoir_command(
     samples: int | None = None,
     seed: int = 0,
     device: str = "auto",
+    baseline: Literal["inverse-rendering"] | None = None,
 ) -> None:
     """The TensoIR benchmark: run the whole method and score it, or score a folder of renderings with --score.
 
@@ -74,20 +75,35 @@ def tensoir_command(
         samples: Samples per photograph.
         seed: Of every random stream.
         device: auto, cpu or cuda.
+        baseline: Also fit materials and light to the photographs on the same geometry, relight them by path tracing,
+            and score that beside the method, in <out>/inverse_rendering.
     """
+    if score is not None and baseline is not None:
+        raise UserError("a baseline needs a run", got="--score with --baseline", fix="leave one of them out")
     if score is not None:
         _report(score_predictions(root, score, scenes, lights, rescale, every, lpips, size), "these renderings", json)
         return
     if out is None or lights_dir is None:
         raise UserError("nothing to run or score", fix="give --out and --lights-dir to run the method, or --score")
     settings = customised(preset, samples=samples, size=size, seed=seed, device=device)
+    if baseline is not None:
+        inverse_rendering.check(settings)
     for scene in scenes:
-        relight_scene(root / scene, lights, lights_dir, settings, size, every, out)
+        names, jobs = relight_scene(root / scene, lights, lights_dir, settings, size, every, out)
+        if baseline is not None:
+            _inverse_rendering(out / scene, names, jobs, settings, out / BASELINE_FOLDER)
     scores = score_predictions(root, out / "predictions", scenes, lights, rescale, every, lpips, size)
     scores["input_light"] = score_input_light(root, scenes, lights, rescale, every, size=size)["psnr"]
     scores["seconds"] = {scene: pipeline.seconds_by_stage(out / scene) for scene in scenes}
     scores["peak_memory_gb"] = {scene: pipeline.peak_memory_gb(out / scene) for scene in scenes}
-    write_json(out / "scores.json", scores)
+    if baseline is not None:
+        folder = out / BASELINE_FOLDER
+        rival = score_predictions(root, folder / "predictions", scenes, lights, rescale, every, lpips, size)
+        rival["input_light"] = scores["input_light"]
+        rival["seconds"] = {s: inverse_rendering.seconds_by_stage(out / s, folder / s) for s in scenes}
+        write_json(folder / FILE_NAME, rival)
+        scores["rivals"] = {inverse_rendering.NAME: rival}
+    write_json(out / FILE_NAME, scores)
     _report(scores, f"{len(scenes)} scenes, {len(lights)} lights, every {every}", json)
 
 
@@ -191,8 +207,12 @@ def relighting_model_command(
 
 def relight_scene(
     scene: Path, lights: Sequence[str], lights_dir: Path, preset: Preset, size: int | None, every: int, out: Path
-) -> None:
-    """Run the method on one scene; the test views land in <out>/predictions/<scene>/<light>/<name>.png on white."""
+) -> tuple[list[str], list[pipeline.LightJob]]:
+    """Run the method on one scene; the test views land in <out>/predictions/<scene>/<light>/<name>.png on white.
+
+    Returns:
+        The names of the test views and what the method was asked for.
+    """
     names, cameras = load_test_cameras(scene, every, (size, size) if size else None)
     test_cameras = out / scene.name / "test_cameras.json"
     write_json(test_cameras, cameras.to_dict())
@@ -201,6 +221,17 @@ def relight_scene(
     for light in lights:
         rendered = out / scene.name / "lights" / light / "test_views"
         write_predictions(rendered, names, out / "predictions" / scene.name / light)
+    return names, jobs
+
+
+def _inverse_rendering(
+    run: Path, names: Sequence[str], jobs: Sequence[pipeline.LightJob], preset: Preset, out: Path
+) -> None:
+    """Relight the scene of a run the other way; the test views land in <out>/predictions as the method's do."""
+    say(f"{inverse_rendering.NAME}: {run.name}")
+    views = inverse_rendering.relight(run, jobs, preset, out / run.name)
+    for light, rendered in views.items():
+        write_predictions(rendered, names, out / "predictions" / run.name / light)
 
 
 def _rendered(methods: Sequence[MethodScores], folders: dict[str, Path]) -> list[RenderedMethod]:
@@ -226,6 +257,16 @@ def _light(folder: Path, name: str) -> Path:
 def _report(scores: dict[str, Any], covers: str, json: Path | None) -> None:
     if json is not None:
         write_json(json, scores)
-    console.print(cell_table(scores["psnr"], scores["ssim"], scores.get("lpips"), scores.get("input_light")))
-    mean = scores["mean"]
-    console.print(published_table(mean["psnr"], mean["ssim"], mean.get("lpips"), covers))
+    rivals = scores.get("rivals", {})
+    columns = {name: rival["psnr"] for name, rival in rivals.items()}
+    table = cell_table(scores["psnr"], scores["ssim"], scores.get("lpips"), scores.get("input_light"), columns)
+    console.print(table)
+    ours = _mean_row("", scores)
+    rows = [_mean_row(f"{name}, same geometry", rival) for name, rival in rivals.items()]
+    console.print(published_table(ours.psnr, ours.ssim, ours.lpips, covers, ours.seconds, rows))
+
+
+def _mean_row(name: str, scores: dict[str, Any]) -> MeanRow:
+    mean, stages = scores["mean"], scores.get("seconds", {})
+    seconds = sum(sum(scene.values()) for scene in stages.values()) if stages else None
+    return MeanRow(name, mean["psnr"], mean["ssim"], mean.get("lpips"), seconds)

@@ -12,8 +12,10 @@ from illuminerf.stages import (
     estimate_illumination,
     evaluate_relighting,
     fit_latent_nerf,
+    fit_materials,
     import_capture,
     relight_views,
+    render_materials,
     render_novel_views,
     render_radiance_cues,
 )
@@ -40,6 +42,9 @@ class Preset:
     turntable: render_novel_views.Config = field(default_factory=render_novel_views.Config)
     test_views: render_novel_views.Config = field(default_factory=render_novel_views.Config)
     evaluation: evaluate_relighting.Config = field(default_factory=evaluate_relighting.Config)
+    materials: fit_materials.Config = field(default_factory=fit_materials.Config)
+    """Of the alternative that benchmarks compare with, as is the next."""
+    material_views: render_materials.Config = field(default_factory=render_materials.Config)
 
 
 EMBEDDED = Preset(
@@ -90,6 +95,8 @@ PAPER = Preset(
     turntable=render_novel_views.Config(
         turntable=render_novel_views.TurntableConfig(num_views=120, height=512, width=512)
     ),
+    materials=fit_materials.Config.fine(),
+    material_views=render_materials.Config(samples_per_pixel=256),
 )
 
 DILIGHTNET = Preset(
@@ -164,4 +171,6 @@ def customised(
         latent_nerf=change(preset.latent_nerf, **common),
         turntable=change(preset.turntable, device=device),
         test_views=change(preset.test_views, device=device),
+        materials=change(preset.materials, seed=seed, fit=change(preset.materials.fit, device=device)),
+        material_views=change(preset.material_views, **common),
     )

@@ -286,3 +286,18 @@ def test_equal_pictures_have_no_error_and_others_have() -> None:
     wrong[3, 4] = 1 - np.round(truth[3, 4])
     drawn = error_map(wrong, truth)
     assert drawn[3, 4].max() > 0.5 and drawn.sum() == drawn[3, 4].sum()
+
+
+def test_inverse_rendering_of_a_run_is_a_method_too(tmp_path: Path) -> None:
+    run = write(tmp_path / "ours")
+    write(
+        run / "inverse_rendering",
+        psnr={"hotdog": {"city": 20.125, "night": 25.5}},
+        seconds={"hotdog": {"materials": 61.5}},
+    )
+    found = read_score_files([run, run / "inverse_rendering"])
+    assert [method.name for method in found] == ["ours", "ours, inverse rendering"]
+    assert "20.12" in latex_tables(found)
+    page = score_page(found).decode()
+    assert "ours, inverse rendering" in page and "61.5" in page
+    assert [method.name for method in read_score_files([write(tmp_path / "alone")])] == ["alone"]

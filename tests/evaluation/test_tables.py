@@ -8,7 +8,7 @@ from rich.console import Console
 
 from illuminerf.evaluation.pictures import FULL_SCALE, error_map, side_by_side
 from illuminerf.evaluation.published import STANFORD_ORB, TENSOIR, gallery_scores
-from illuminerf.evaluation.tables import cell_table, mean_of, published_table
+from illuminerf.evaluation.tables import MeanRow, cell_table, mean_of, published_table
 
 
 def printed(table: object) -> str:
@@ -30,6 +30,16 @@ def test_unknown_cells_have_no_gallery_figure() -> None:
     text = printed(cell_table({"mug": {"lamp": 21.5}}, {"mug": {"lamp": 0.91}}, {"mug": {"lamp": 0.1}}))
     assert "-" in text and "0.100" in text
     assert gallery_scores("mug", "lamp") is None
+
+
+def test_rivals_stand_beside_ours_with_their_time() -> None:
+    one = {"hotdog": {"city": 21.5}}
+    lines = printed(cell_table(one, one, rivals={"inverse rendering": {"hotdog": {"city": 23.25}}})).splitlines()
+    assert sum("23.25" in line for line in lines) == 2 and any("inverse rendering" in line for line in lines)
+    rival = MeanRow("inverse rendering, same geometry", 23.25, 0.9, None, 1234.4)
+    lines = printed(published_table(27.0, 0.93, None, "hotdog", 2000.2, [rival])).splitlines()
+    ours, theirs = (next(line for line in lines if name in line) for name in ("ours", "same geometry"))
+    assert "2000 s" in ours and "23.25" in theirs and "1234 s" in theirs and "*" not in theirs
 
 
 def test_published_rows_are_marked() -> None:

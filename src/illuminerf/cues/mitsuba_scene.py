@@ -17,8 +17,8 @@ _SAMPLES_PER_PASS = 2**20
 # Pixels of a side of what one thread of scalar_rgb renders. Left to itself Mitsuba makes as many blocks as there are
 # threads, and each block has its own random numbers.
 _BLOCK_SIDE = 32
-# Our equirectangular axes in Mitsuba's own frame for environment maps (docs/conventions.md).
-_WORLD_FROM_ENVMAP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
+WORLD_FROM_ENVMAP = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
+"""Our equirectangular axes in Mitsuba's own frame for environment maps (docs/conventions.md)."""
 _OPENGL_FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
 
 
@@ -48,8 +48,8 @@ class MitsubaScene:
                 "type": "scene",
                 "light": {
                     "type": "envmap",
-                    "bitmap": mi.Bitmap(_rows_from_pole_to_pole(light.linear_rgb)),
-                    "to_world": mi.ScalarTransform4f(_WORLD_FROM_ENVMAP),
+                    "bitmap": mi.Bitmap(rows_from_pole_to_pole(light.linear_rgb)),
+                    "to_world": mi.ScalarTransform4f(WORLD_FROM_ENVMAP),
                 },
                 **shapes,
             }
@@ -69,7 +69,7 @@ class MitsubaScene:
                 fix="resize the lights",
             )
         # Mitsuba pads the map by one wrapped column at either side
-        rows = _rows_from_pole_to_pole(light.linear_rgb)
+        rows = rows_from_pole_to_pole(light.linear_rgb)
         padded = np.concatenate([rows[:, -1:], rows, rows[:, :1]], 1)
         self.parameters["light.data"] = self.mitsuba.TensorXf(np.ascontiguousarray(padded, np.float32))
         self.parameters.update()
@@ -146,7 +146,7 @@ class MitsubaScene:
         return values, int(sensor.sampler().sample_count())
 
 
-def _rows_from_pole_to_pole(linear_rgb: np.ndarray) -> np.ndarray:
+def rows_from_pole_to_pole(linear_rgb: np.ndarray) -> np.ndarray:
     """Our maps have their samples in the middle of each row; Mitsuba's first and last row lie on the poles."""
     height = len(linear_rgb)
     at = np.clip(np.arange(height) * (height / max(height - 1, 1)) - 0.5, 0, height - 1)

@@ -12,6 +12,8 @@ from illuminerf.workflow.atomic import read_json
 from illuminerf.workflow.errors import UserError
 
 FILE_NAME = "scores.json"
+BASELINE_FOLDER = "inverse_rendering"
+"""Beside a run's score file: that of inverse rendering on the same geometry."""
 METRICS = ("psnr", "ssim", "lpips")
 Cell = tuple[str, str]
 """Scene and light."""
@@ -64,6 +66,8 @@ def all_cells(methods: Sequence[MethodScores]) -> list[Cell]:
 def read_score_files(paths: Sequence[Path]) -> list[MethodScores]:
     """Read folders with a scores.json, or score files of any name; a method is named after its folder or file.
 
+    Where a folder also holds the scores of inverse rendering in `BASELINE_FOLDER`, that is a method too.
+
     Raises:
         UserError: there is none, one is missing, damaged or not a score file, or two have the same name.
     """
@@ -80,7 +84,7 @@ def read_score_files(paths: Sequence[Path]) -> list[MethodScores]:
                 fix="check the path, or run illuminerf benchmark tensoir first",
             )
         name = _name(file)
-        if name in found:
+        if name in found and found[name] != file:
             raise UserError(
                 "two methods have the same name",
                 got=f"{name!r} for {found[name]} and {file}",
@@ -88,11 +92,16 @@ def read_score_files(paths: Sequence[Path]) -> list[MethodScores]:
                 fix="rename one of the folders",
             )
         found[name] = file
+        baseline = path / BASELINE_FOLDER / FILE_NAME
+        if baseline.is_file():
+            found[_name(baseline)] = baseline
     return [_read(name, file) for name, file in found.items()]
 
 
 def _name(file: Path) -> str:
     whole = file.resolve()
+    if whole.name == FILE_NAME and whole.parent.name == BASELINE_FOLDER:
+        return f"{whole.parent.parent.name}, inverse rendering"
     return " ".join((whole.parent.name if file.name == FILE_NAME else whole.stem).split())
 
 

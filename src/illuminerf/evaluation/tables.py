@@ -1,6 +1,7 @@
 """Score tables for a terminal: ours first, published figures marked as such."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,15 +20,21 @@ def mean_of(cells: PerLight) -> float:
 
 
 def cell_table(
-    psnr: PerLight, ssim: PerLight, lpips: PerLight | None = None, input_light: PerLight | None = None
+    psnr: PerLight,
+    ssim: PerLight,
+    lpips: PerLight | None = None,
+    input_light: PerLight | None = None,
+    rivals: Mapping[str, PerLight] | None = None,
 ) -> Table:
     """One row per scene and light, beside the PSNR of the gallery's renderings where they are known, and
-    the mean. `input_light` is what doing nothing scores on the same frames; by default that of the gallery.
+    the mean. `input_light` is what doing nothing scores on the same frames; by default that of the gallery. `rivals`
+    are the PSNR of other methods of the same run.
     """
+    rivals = rivals or {}
     table = Table(title="Relighting, per scene and light (gallery: published renderings under the same rule)")
     for heading in ("scene", "light"):
         table.add_column(heading)
-    for heading in ("PSNR", "SSIM", "LPIPS", "paper", "TensoIR", "input light"):
+    for heading in ("PSNR", "SSIM", "LPIPS", *rivals, "paper", "TensoIR", "input light"):
         table.add_column(heading, justify="right")
     known: list[GalleryScores] = []
     for scene, lights in psnr.items():
@@ -41,6 +48,7 @@ def cell_table(
                 beside[2] = input_light[scene][light]
             distance = lpips[scene][light] if lpips else None
             table.add_row(scene, light, *_numbers([value], 2), *_numbers([ssim[scene][light], distance], 3),
+                          *_numbers([rival.get(scene, {}).get(light) for rival in rivals.values()], 2),
                           *_numbers(beside, 2))  # fmt: skip
     complete = len(known) == sum(map(len, psnr.values()))
     columns = [[row.paper for row in known], [row.tensoir for row in known], [row.input_light for row in known]]
@@ -53,23 +61,47 @@ def cell_table(
         "",
         *_numbers([mean_of(psnr)], 2),
         *_numbers([mean_of(ssim), mean_of(lpips) if lpips else None], 3),
+        *_numbers([mean_of(rival) for rival in rivals.values()], 2),
         *_numbers(means, 2),
     )
     return table
 
 
-def published_table(psnr: float, ssim: float, lpips: float | None, covers: str) -> Table:
-    """Our means, over what `covers` says, above the published rows of the whole TensoIR benchmark."""
+@dataclass(frozen=True)
+class MeanRow:
+    """Means of one method of this run."""
+
+    method: str
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+    seconds: float | None = None
+    """Of all stages."""
+
+
+def published_table(
+    psnr: float,
+    ssim: float,
+    lpips: float | None,
+    covers: str,
+    seconds: float | None = None,
+    rivals: Sequence[MeanRow] = (),
+) -> Table:
+    """Our means, over what `covers` says, and those of `rivals`, above the published rows of the whole TensoIR
+    benchmark."""
     table = Table(title="TensoIR benchmark: rows marked * are published figures for all 4 scenes and 5 lights")
     table.add_column("method")
     for heading in ("PSNR", "SSIM", "LPIPS"):
         table.add_column(heading, justify="right")
     table.add_column("source")
-    table.add_row(f"ours ({covers})", *_numbers([psnr], 2), *_numbers([ssim, lpips], 3), "this run")
+    for row in (MeanRow(f"ours ({covers})", psnr, ssim, lpips, seconds), *rivals):
+        time = "" if row.seconds is None else f", {row.seconds:.0f} s"
+        table.add_row(row.method, *_numbers([row.psnr], 2), *_numbers([row.ssim, row.lpips], 3), f"this run{time}")
     table.add_section()
-    for row in TENSOIR:
-        note = f"{row.source}; {row.note}" if row.note else row.source
-        table.add_row(f"{row.method} *", *_numbers([row.psnr], 2), *_numbers([row.ssim, row.lpips], 3), note)
+    for figures in TENSOIR:
+        note = f"{figures.source}; {figures.note}" if figures.note else figures.source
+        numbers = (*_numbers([figures.psnr], 2), *_numbers([figures.ssim, figures.lpips], 3))
+        table.add_row(f"{figures.method} *", *numbers, note)
     return table
 
 
