@@ -6,7 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from illuminerf.cues.renderer import CueSampling
+from illuminerf.fields.appearance import AppearanceConfig
+from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.optimisation import OptimiserConfig
+from illuminerf.fields.radiance_field import FieldConfig
+from illuminerf.fields.surface import SurfaceConfig
 from illuminerf.stages import (
     estimate_geometry,
     estimate_illumination,
@@ -52,7 +56,12 @@ EMBEDDED = Preset(
     description="The default: for two CPU cores and photographs of about 200 pixels; a GPU makes it faster.",
     capture=import_capture.Config(size=200),
     geometry=estimate_geometry.Config(
-        optimiser=OptimiserConfig(num_steps=3000, rays_per_step=1024, warmup_steps=60), mesh_resolution=224
+        radiance_field=FieldConfig(
+            surface=SurfaceConfig(grid=HashGridConfig(log2_entries=18)),
+            appearance=AppearanceConfig(grid=HashGridConfig(log2_entries=18)),
+        ),
+        optimiser=OptimiserConfig(num_steps=3000, rays_per_step=1024, warmup_steps=60),
+        mesh_resolution=224,
     ),
     illumination=estimate_illumination.Config(sampling=CueSampling(samples_per_pixel=16)),
     # cheap; noise of the cues reaches the samples, and the distillation averages over views

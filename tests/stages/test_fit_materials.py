@@ -118,7 +118,8 @@ def test_relit_it_looks_like_the_truth(run: Path, materials: Path, tmp_path: Pat
     grey = tmp_path / "grey"
     count = len(mesh.vertices)
     save_materials(grey, mesh, Material(np.full((count, 3), 0.4), np.full(count, 0.5), np.zeros(count)), lamp(0.5))
-    wanted = render_shaded([(mesh, Material(paint(mesh), 0.6))], photographed(40), lamp(4), 64).premultiplied()
+    truth = render_shaded([(mesh, Material(paint(mesh), 0.6))], photographed(40), lamp(4), 64)
+    wanted = np.stack(list(truth.premultiplied()))
     cameras = run / "lights" / "lamp4" / "test_cameras.json"
 
     def score(folder: Path) -> float:

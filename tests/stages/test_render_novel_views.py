@@ -94,12 +94,11 @@ def test_cameras_from_a_file_and_resume(sphere_field: Path, tmp_path: Path) -> N
     assert (out / "images" / "000.png").stat().st_mtime_ns == kept
 
 
-def test_a_number_of_samples_asks_for_those_of_training(sphere_geometry: Path, tmp_path: Path) -> None:
-    """On a real fit the default is closer to many samples than as many as in training are."""
-    configs = {"marched": None, "few": 10, "many": 160}
+def test_a_march_comes_closer_to_many_samples_than_few_do(sphere_geometry: Path, tmp_path: Path) -> None:
+    configs = {"marched": (None, True), "few": (10, False), "many": (160, False)}
     images = {}
-    for name, num_samples in configs.items():
-        config = render_novel_views.Config(turntable=_TURNTABLE, num_samples=num_samples, device="cpu")
+    for name, (num_samples, marches) in configs.items():
+        config = render_novel_views.Config(turntable=_TURNTABLE, num_samples=num_samples, marches=marches, device="cpu")
         out = render_novel_views.run(sphere_geometry, None, config, tmp_path / name)
         pixels = np.stack([read_png(out / "images" / f"{view:03d}.png") for view in range(3)])
         images[name] = pixels[..., :3] * pixels[..., 3:]
@@ -108,6 +107,8 @@ def test_a_number_of_samples_asks_for_those_of_training(sphere_geometry: Path, t
 
 
 def test_errors(sphere_field: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="march"):
+        render_novel_views.Config(num_samples=4, marches=True)
     with pytest.raises(UserError, match="latent code 9"):
         wrong = render_novel_views.Config(turntable=_TURNTABLE, latent_index=9, device="cpu")
         render_novel_views.run(sphere_field, None, wrong, tmp_path / "a")

@@ -79,8 +79,8 @@ def render_image(
 ) -> RenderedImage:
     """Render one view; pixels whose rays miss the shell are transparent.
 
-    Deviation: UniSDF renders images with the samples of training. Marching the surface costs less and is closer to
-    the integral that both stand for (`render_image_as_trained`, and the test that compares them).
+    Deviation: UniSDF renders images with the samples of training (`render_image_as_trained`). Marching the surface is
+    closer to the integral that both stand for, as a test shows.
 
     Args:
         shell: `surface_shell` of the field's surface.

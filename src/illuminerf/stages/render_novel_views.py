@@ -49,7 +49,10 @@ class Config:
     latent_index: int | None = None
     """Which training image's latent code to render; None is the zero code, as in the paper's results."""
     num_samples: int | None = None
-    """Samples per ray, placed as in training; None follows each ray through the surface, in fewer and finer steps."""
+    """Samples per ray, placed as in training; None takes those of training."""
+    marches: bool = False
+    """Follow each ray through the surface in steps as fine as beta instead. Closer to the integral that the field
+    stands for; it then also shows what no photograph constrains, such as the underside of what stands on a table."""
     rays_per_chunk: int = 1 << 17
     """Rays at a time, which bounds memory."""
     device: str = "auto"
@@ -58,6 +61,8 @@ class Config:
     def __post_init__(self) -> None:
         if self.rays_per_chunk < 1 or (self.num_samples is not None and self.num_samples < 2):
             raise UserError("rays per chunk and samples per ray must be positive", got=str(self))
+        if self.marches and self.num_samples is not None:
+            raise UserError("steps of a march are not counted", got=str(self), fix="leave out num_samples or marches")
 
 
 def run(latent_nerf_path: Path, cameras_path: Path | None, config: Config, out: Path) -> Path:
@@ -101,13 +106,14 @@ def _paths(out: Path, view: int) -> tuple[Path, Path]:
 
 def _renderer(stored: StoredField, config: Config) -> Callable[[Cameras, int, torch.Tensor | None], RenderedImage]:
     chunk = config.rays_per_chunk
-    if config.num_samples is None:
+    if config.marches:
         shell = surface_shell(stored.field.surface, stored.cells)
         return partial(render_image, stored.field, shell, chunk=chunk)
     trained = stored.field.config
+    num_samples = config.num_samples or trained.num_samples
     # what is left out must not grow with the number of samples
-    least = trained.min_weight * min(trained.num_samples / config.num_samples, 1)
-    stored.field.config = replace(trained, num_samples=config.num_samples, min_weight=least)
+    least = trained.min_weight * min(trained.num_samples / num_samples, 1)
+    stored.field.config = replace(trained, num_samples=num_samples, min_weight=least)
     return partial(render_image_as_trained, stored.field, stored.cells, chunk=min(chunk, _TRAINED_CHUNK))
 
 
