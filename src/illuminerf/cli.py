@@ -10,7 +10,17 @@ from typing import Annotated, Any, ClassVar
 import tyro
 from rich.markup import escape
 
-from illuminerf import ablation, benchmark, datasets, demo, models, orb_illumination_study, pipeline, stanford_orb
+from illuminerf import (
+    ablation,
+    benchmark,
+    datasets,
+    demo,
+    lights,
+    models,
+    orb_illumination_study,
+    pipeline,
+    stanford_orb,
+)
 from illuminerf.data.objaverse_download import download_objaverse
 from illuminerf.data.object_collection import read_ids
 from illuminerf.presets import PRESETS, Preset, customised
@@ -51,13 +61,15 @@ def relight_command(
     exposure: float = 0.0,
     background: str | None = None,
     model: str | None = None,
+    ldr_peak: float = 1.0,
 ) -> None:
     """Relight a capture: every stage of the method, from photographs to turntable, mesh and report.
 
     Args:
         capture: Folder of posed photographs (transforms.json, a TensoIR scene, or images/ + cameras.json).
         out: Folder of the run; run the same command again to go on after an interruption.
-        light: Equirectangular .exr or .hdr map; repeat for several lights, geometry is estimated once.
+        light: Equirectangular .exr or .hdr map, or a name of `illuminerf lights list`; repeat for several lights,
+            geometry is estimated once.
         preset: Settings of all stages: see `illuminerf presets`.
         samples: Samples per photograph (S in the paper).
         size: Longest side of the photographs in pixels; larger ones are averaged down.
@@ -67,12 +79,13 @@ def relight_command(
         exposure: Stops by which the light is made brighter.
         background: Plain background to cut away where the photographs have no masks: white or black.
         model: Another relighting model than the preset's: a folder, embedded or dilightnet.
+        ldr_peak: Radiance that the white of a PNG or JPEG light stands for; 1 takes it as it is.
     """
     settings = customised(
         preset, samples=samples, size=size, seed=seed, device=device, rotate_degrees=rotate, exposure_stops=exposure,
         background=background, model=model,
     )  # fmt: skip
-    pipeline.relight(capture, [pipeline.LightJob(path) for path in light], settings, out)
+    pipeline.relight(capture, [pipeline.LightJob(path, ldr_peak=ldr_peak) for path in light], settings, out)
     say(f"done: {out / 'report.html'}, {out / 'turntable.mp4'}, {out / 'mesh.glb'}")
 
 
@@ -282,6 +295,11 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
         "example-assets": example_assets_command,
         "tensoir-gallery": datasets.tensoir_gallery_command,
         "synthetic-orb": datasets.synthetic_orb_command,
+    },
+    "lights": {
+        "list": lights.list_command,
+        "preview": lights.preview_command,
+        "convert": lights.convert_command,
     },
     "models": {
         "list": models.list_command,
