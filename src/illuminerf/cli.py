@@ -172,6 +172,23 @@ def example_assets_command(folder: PositionalPath) -> None:
     say(f"done: {objects}, {lights}")
 
 
+def view_command(
+    run: PositionalPath, host: str = "127.0.0.1", port: int = 8080, size: int = 512, device: str = "auto"
+) -> None:
+    """Look at a finished run in the browser: orbit, switch lights, slide through latents, see cues, normals and mesh.
+
+    Args:
+        run: What relight or demo wrote.
+        host: Address to listen at; 0.0.0.0 lets other machines in, without any password.
+        port: The next free one is taken where this is busy.
+        size: Longest side of the finest picture in pixels.
+        device: auto, cpu or cuda.
+    """
+    from illuminerf.viewer import server
+
+    server.view_command(run, host, port, size, device)
+
+
 class StageCall:
     """Parsed arguments of one stage's subcommand."""
 
@@ -210,6 +227,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "relight": relight_command,
     "demo": demo_command,
     "presets": presets_command,
+    "view": view_command,
     "import-capture": _stage(
         import_capture.run,
         import_capture.Config,
