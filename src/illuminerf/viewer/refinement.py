@@ -12,7 +12,7 @@ from illuminerf.viewer.renderer import Look, Picture, ViewRenderer
 _FIRST_SECONDS = 0.12  # about what the first picture may take
 _BAND_SECONDS = 0.15  # and how long a change may wait for an old one
 _STEP = 2.0  # in side length, from one picture to the next
-_LEAST_SIDE = 24
+_LEAST_SIDE = 48
 
 
 @dataclass

@@ -12,7 +12,7 @@ from illuminerf.fields.storage import StoredField, load_field
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import srgb_from_linear
-from illuminerf.scene.light_preview import viewing_exposure
+from illuminerf.scene.light_preview import matte_ball
 from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.viewer.finished_run import FinishedRun
 from illuminerf.workflow.device import resolve_device
@@ -22,7 +22,8 @@ AS_PHOTOGRAPHED = "(as photographed)"
 RELIT, NORMALS, CUES = "relit", "normals", ("diffuse cue", "GGX 0.05 cue", "GGX 0.13 cue", "GGX 0.34 cue")
 MODES = (RELIT, NORMALS, *CUES)
 FAR = 100.0
-_CUE_SAMPLES = 8
+_CUE_SAMPLES = 16
+_BRIGHTEST_WHITE = 0.9  # linear, of a white ball in the open
 _BACKGROUND = 1.0
 _LEAST_ALPHA = 1e-3
 
@@ -63,7 +64,7 @@ class ViewRenderer:
         self.lights = (*run.lights, AS_PHOTOGRAPHED)
         self._device_name, self._device = device, resolve_device(device)
         self._fields: dict[str, StoredField] = {}
-        self._tracers: dict[str, tuple[MitsubaCueRenderer, EnvironmentMap]] = {}
+        self._tracers: dict[str, tuple[MitsubaCueRenderer, EnvironmentMap, float]] = {}
         self._mesh: TriangleMesh | None = None
 
     def num_latents(self, light: str) -> int:
@@ -111,13 +112,14 @@ class ViewRenderer:
         if look.light not in self._tracers:
             light = EnvironmentMap.load(self.run.lights[look.light] / "cues" / "light.exr")
             sampling = CueSampling(samples_per_pixel=_CUE_SAMPLES, device=self._device_name)
-            self._tracers[look.light] = MitsubaCueRenderer(self.mesh(), light, sampling), light
-        tracer, light = self._tracers[look.light]
+            # of the light, not of the picture: bands must fit together
+            exposure = _BRIGHTEST_WHITE / max(float(matte_ball(light, 32)[0].max()), 1e-6)
+            self._tracers[look.light] = MitsubaCueRenderer(self.mesh(), light, sampling), light, exposure
+        tracer, light, exposure = self._tracers[look.light]
         layers = tracer.render(camera, 0, light, seed=0)
         first = 3 * CUES.index(look.mode)
         assert len(layers) == 3 * len(CUE_NAMES) + 1
-        # an exposure of the light, not of the picture: bands must fit together
-        linear_rgb = layers[first : first + 3].transpose(1, 2, 0) * viewing_exposure(light.linear_rgb)
+        linear_rgb = layers[first : first + 3].transpose(1, 2, 0) * exposure
         alpha = layers[-1]
         depth = np.where(alpha > 0.5, float(np.linalg.norm(camera.positions[0])), FAR).astype(np.float32)
         return Picture(_over_white(srgb_from_linear(linear_rgb), alpha), depth)

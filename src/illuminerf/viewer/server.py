@@ -19,6 +19,7 @@ from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say
 
 _FRUSTUM_SCALE, _THUMBNAIL, _MAX_FRUSTUMS = 0.12, 64, 60
+_LARGEST_EXACT = 200
 _MESH_COLOUR = (150, 160, 175)
 _FIRST_FOV = 0.7
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
@@ -152,7 +153,7 @@ class _Page:
     def __init__(self, viewer: Viewer, client: Any, lock: threading.Lock, speed: Speed) -> None:
         self._viewer, self._client, self._lock, self._speed = viewer, client, lock, speed
         self._version, self._wake, self._is_open = 0, threading.Event(), True
-        self._status = client.gui.add_markdown("")
+        self._status = client.gui.add_markdown("loading ...")
         client.camera.on_update(lambda _: self.ask())
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
@@ -200,7 +201,8 @@ class _Page:
     def _show(self, picture: Picture, seconds: float) -> None:
         height, width = picture.depth.shape
         depth = picture.depth if self._viewer.needs_depth() else None
-        self._client.scene.set_background_image(to_uint8(picture.srgb), format="jpeg", jpeg_quality=92, depth=depth)
+        kind: Any = "png" if max(height, width) <= _LARGEST_EXACT else "jpeg"  # enlarged, a JPEG's blocks show
+        self._client.scene.set_background_image(to_uint8(picture.srgb), format=kind, jpeg_quality=92, depth=depth)
         self._status.content = f"{width} x {height}, {seconds:.2f} s"
 
 
