@@ -34,6 +34,8 @@ def save_sphere(folder: Path, seed: int, latents: torch.Tensor | None) -> None:
     field = RadianceField(config)
     with torch.no_grad():
         field.surface.head.weight.zero_()
+        for parameter in field.surface.normal_mlp[2].parameters():
+            parameter.zero_()  # normals point away from the origin
     save_field(folder, StoredField(field, OccupiedCells(torch.ones(16, 16, 16, dtype=torch.bool)), latents))
     (folder / "DONE").write_text("finished\n")
 

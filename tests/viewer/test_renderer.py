@@ -56,7 +56,7 @@ def test_depth_is_that_of_the_sphere(renderer: ViewRenderer) -> None:
 
 def test_codes_are_blended_in_straight_lines() -> None:
     codes = torch.tensor([[1.0, 0.0], [0.0, 4.0]])
-    assert code_at(codes, 0) is None and code_at(None, 1.5) is None
+    assert code_at(codes, 0.0) is None and code_at(None, 1.5) is None
     for place, wanted in (
         (0.5, [0.5, 0.0]),
         (1.0, [1.0, 0.0]),
