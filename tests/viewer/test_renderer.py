@@ -85,7 +85,7 @@ def test_sizes_grow_from_a_quick_one_to_the_finest() -> None:
     assert sizes(512, 1e5, 1.5) == [134, 268, 512]
     assert sizes(512, 1.0, 1.5)[0] == 48 and sizes(512, 1e9, 1.5) == [512]
     assert all(
-        found[-1] == 300 and found == sorted(set(found)) for found in (sizes(300, s, 1.0) for s in (1, 1e4, 1e5))
+        found[-1] == 300 and found == sorted(set(found)) for found in (sizes(300, s, 1.0) for s in (1.0, 1e4, 1e5))
     )
 
 
