@@ -30,7 +30,7 @@ def relight(
 
     Args:
         photos: folder of posed photographs (see docs/captures.md).
-        lights: equirectangular .exr or .hdr maps; geometry is estimated once for all.
+        lights: equirectangular .exr or .hdr maps, or names of bundled lights; geometry is estimated once for all.
         out: folder of the run; called again with the same arguments it goes on where it stopped.
         preset: settings of all stages.
         samples: samples per photograph, S in the paper.

@@ -16,6 +16,7 @@ from illuminerf import (
     datasets,
     demo,
     geometry_benchmark,
+    lights,
     models,
     orb_illumination_study,
     pipeline,
@@ -65,13 +66,15 @@ def relight_command(
     background: str | None = None,
     model: str | None = None,
     mesh: Path | None = None,
+    ldr_peak: float = 1.0,
 ) -> None:
     """Relight a capture: every stage of the method, from photographs to turntable, mesh and report.
 
     Args:
         capture: Folder of posed photographs (transforms.json, a TensoIR scene, or images/ + cameras.json).
         out: Folder of the run; run the same command again to go on after an interruption.
-        light: Equirectangular .exr or .hdr map; repeat for several lights, geometry is estimated once.
+        light: Equirectangular .exr or .hdr map, or a name of `illuminerf lights list`; repeat for several lights,
+            geometry is estimated once.
         preset: Settings of all stages: see `illuminerf presets`.
         samples: Samples per photograph (S in the paper).
         size: Longest side of the photographs in pixels; larger ones are averaged down.
@@ -82,12 +85,14 @@ def relight_command(
         background: Background to cut away where the photographs have no masks: plain (any even colour), white or black.
         model: Another relighting model than the preset's: a folder, embedded or dilightnet.
         mesh: A .glb, .obj or .ply mesh in the capture's world that takes the place of estimated geometry.
+        ldr_peak: Radiance that the white of a PNG or JPEG light stands for; 1 takes it as it is.
     """
     settings = customised(
         preset, samples=samples, size=size, seed=seed, device=device, rotate_degrees=rotate, exposure_stops=exposure,
         background=background, model=model,
     )  # fmt: skip
-    pipeline.relight(capture, [pipeline.LightJob(path) for path in light], settings, out, mesh)
+    jobs = [pipeline.LightJob(path, ldr_peak=ldr_peak) for path in light]
+    pipeline.relight(capture, jobs, settings, out, mesh)
     say(f"done: {out / 'report.html'}, {out / 'turntable.mp4'}, {out / 'mesh.glb'}")
 
 
@@ -174,6 +179,23 @@ def example_assets_command(folder: PositionalPath) -> None:
     say(f"done: {objects}, {lights}")
 
 
+def view_command(
+    run: PositionalPath, host: str = "127.0.0.1", port: int = 8080, size: int = 512, device: str = "auto"
+) -> None:
+    """Look at a finished run in the browser: orbit, switch lights, slide through latents, see cues, normals and mesh.
+
+    Args:
+        run: What relight or demo wrote.
+        host: Address to listen at; 0.0.0.0 lets other machines in, without any password.
+        port: The next free one is taken where this is busy.
+        size: Longest side of the finest picture in pixels.
+        device: auto, cpu or cuda.
+    """
+    from illuminerf.viewer import server
+
+    server.view_command(run, host, port, size, device)
+
+
 class StageCall:
     """Parsed arguments of one stage's subcommand."""
 
@@ -212,6 +234,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "relight": relight_command,
     "demo": demo_command,
     "presets": presets_command,
+    "view": view_command,
     "import-capture": _stage(
         import_capture.run,
         import_capture.Config,
@@ -316,6 +339,11 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
         "example-assets": example_assets_command,
         "tensoir-gallery": datasets.tensoir_gallery_command,
         "synthetic-orb": datasets.synthetic_orb_command,
+    },
+    "lights": {
+        "list": lights.list_command,
+        "preview": lights.preview_command,
+        "convert": lights.convert_command,
     },
     "models": {
         "list": models.list_command,

@@ -23,9 +23,9 @@ from illuminerf.evaluation.benchmark_rule import on_white
 from illuminerf.presets import Preset
 from illuminerf.report import write_report
 from illuminerf.scene.cameras import Cameras
-from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import read_png
 from illuminerf.scene.meshes import TriangleMesh
+from illuminerf.scene.named_lights import find_light, light_file
 from illuminerf.scene.video import write_mp4
 from illuminerf.stages import (
     estimate_geometry,
@@ -51,11 +51,13 @@ class LightJob:
     """One target light, and what the caller wants of it beside the turntable."""
 
     light: Path
-    """EXR or HDR environment map."""
+    """Environment map, or the name of a bundled light."""
     test_cameras: Path | None = None
     """cameras.json, in the caller's world, of further views to render."""
     truth: Path | None = None
     """Folder with the truth of those views under this light, <000>.png straight RGBA."""
+    ldr_peak: float = 1.0
+    """Radiance that the white of a PNG or JPEG stands for."""
 
     @property
     def name(self) -> str:
@@ -85,7 +87,8 @@ def relight(
     for job in jobs:
         say(f"light: {job.name}")
         folder = out / "lights" / job.name
-        made = lights[job.name] = relight_under(capture, geometry, illumination, job.light, preset, folder)
+        light = light_file(job.light, folder, job.ldr_peak)
+        made = lights[job.name] = relight_under(capture, geometry, illumination, light, preset, folder)
         if job.test_cameras is not None:
             cameras = in_unit_ball(job.test_cameras, capture, folder / "test_cameras.json")
             made["test_views"] = render_novel_views.run(
@@ -173,7 +176,7 @@ def _check(jobs: Sequence[LightJob]) -> None:
     if len(set(names)) < len(names):
         raise UserError("two lights have the same name", got=", ".join(names), fix="rename one of the files")
     for job in jobs:
-        EnvironmentMap.load(job.light)
+        find_light(job.light, job.ldr_peak)
 
 
 def in_unit_ball(cameras: Path, capture: Path, out: Path) -> Path:

@@ -10,6 +10,7 @@ import numpy as np
 from illuminerf.evaluation.benchmark_rule import on_white
 from illuminerf.scene.environment import EnvironmentMap, chrome_ball
 from illuminerf.scene.images import composite, read_exr, read_png, srgb_from_linear
+from illuminerf.scene.light_preview import viewing_exposure
 from illuminerf.scene.web_page import evenly_spread, picture_row, web_page
 from illuminerf.workflow.artefact import read_metrics
 from illuminerf.workflow.atomic import read_json, write_bytes
@@ -68,7 +69,7 @@ def _illumination(illumination: Path) -> str:
 def _light(name: str, artefacts: dict[str, Path], capture: Path) -> str:
     light = EnvironmentMap.load(artefacts["cues"] / "light.exr")
     ball, alpha = chrome_ball(light, 160)
-    exposure = _exposure(light.linear_rgb)
+    exposure = viewing_exposure(light.linear_rgb)
     panorama = np.clip(srgb_from_linear(light.linear_rgb * exposure), 0, 1)
     ball_srgb = composite(np.clip(srgb_from_linear(ball * exposure), 0, 1), alpha, 1.0)
     parts = [f"<h2>Light: {html.escape(name)}</h2>"]
@@ -103,7 +104,7 @@ def _cue_pictures(path: Path) -> list[tuple[np.ndarray, str]]:
     pictures = []
     for cue, title in _CUE_TITLES.items():
         linear_rgb = np.stack([channels[f"{cue}.{c}"] for c in "RGB"], -1)
-        srgb = np.clip(srgb_from_linear(linear_rgb * _exposure(linear_rgb)), 0, 1)
+        srgb = np.clip(srgb_from_linear(linear_rgb * viewing_exposure(linear_rgb)), 0, 1)
         pictures.append((np.clip(srgb + 1 - channels["A"][..., None], 0, 1), title))  # premultiplied, over white
     return pictures
 
@@ -146,9 +147,3 @@ def _costs(stages: dict[str, Path], lights: dict[str, dict[str, Path]]) -> str:
     head = "<tr><th>stage</th><th>light</th><th>seconds</th><th>peak memory, GB</th></tr>"
     note += "; " + html.escape(versions["platform"])
     return f"<h2>Cost</h2><table>{head}{''.join(lines)}</table><p class=note>{note}</p>"
-
-
-def _exposure(linear_rgb: np.ndarray) -> float:
-    """A factor for looking at radiance: the mean of what is lit becomes a mid grey."""
-    lit = linear_rgb[linear_rgb.max(-1) > 1e-4]
-    return float(np.clip(0.35 / max(float(np.minimum(lit, 4).mean()), 1e-6), 0.05, 8)) if lit.size else 1.0

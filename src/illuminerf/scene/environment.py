@@ -12,6 +12,7 @@ import numpy as np
 
 from illuminerf.scene.images import linear_from_srgb, read_png, read_rgb_exr, write_rgb_exr
 from illuminerf.scene.radiance_hdr import read_hdr
+from illuminerf.scene.tone import expanded
 from illuminerf.workflow.errors import UserError
 
 _UNDERSHOOT = 0.05  # of the mean radiance
@@ -57,8 +58,11 @@ class EnvironmentMap:
             raise UserError(f"{label} is all black", fix="choose a light that emits something")
 
     @staticmethod
-    def load(path: Path) -> "EnvironmentMap":
+    def load(path: Path, ldr_peak: float = 1.0) -> "EnvironmentMap":
         """Read an EXR or Radiance HDR map; PNG and JPEG are taken as sRGB, with a warning.
+
+        Args:
+            ldr_peak: radiance that the white of a PNG or JPEG stands for; the rest is expanded along with it.
 
         Raises:
             UserError: missing, unreadable, not 2:1, or with values no light has.
@@ -71,13 +75,15 @@ class EnvironmentMap:
             image = read_rgb_exr(path)
         elif suffix == ".hdr":
             image = read_hdr(path)
-        elif suffix in _LDR_SUFFIXES:
-            image = linear_from_srgb(read_png(path)[..., :3])
-            warnings.warn(
-                f"{path.name} is a low dynamic range image: lamps and the sun are cut off at 1, so shadows "
-                "will be too soft and highlights too dark. Prefer an .exr or .hdr map.",
-                stacklevel=2,
+        elif is_low_range(path):
+            image = expanded(linear_from_srgb(read_png(path)[..., :3]), ldr_peak)
+            outcome = (
+                "are cut off at 1, so shadows will be too soft and highlights too dark. Prefer an .exr or .hdr map, "
+                "or guess with --ldr-peak how bright they are"
+                if ldr_peak == 1
+                else f"are taken to reach {ldr_peak:g}, which is a guess. Prefer an .exr or .hdr map"
             )
+            warnings.warn(f"{path.name} is a low dynamic range image: lamps and the sun {outcome}.", stacklevel=2)
         else:
             raise UserError(
                 f"{path.name} is not a known kind of light",
@@ -167,13 +173,23 @@ class EnvironmentMap:
 
 def chrome_ball(light: EnvironmentMap, size: int) -> tuple[np.ndarray, np.ndarray]:
     """A mirror ball under `light` seen from +x: linear_rgb [size, size, 3] and alpha [size, size]."""
-    centres = (np.arange(size) + 0.5) / size * 2 - 1
-    up, right = np.meshgrid(-centres, centres, indexing="ij")
-    inside = right**2 + up**2 < 1
-    toward = np.sqrt(np.maximum(1 - right**2 - up**2, 0))
-    normal = np.stack([toward, right, up], -1)  # the camera looks along -x, so +y is to its right
+    normal, inside = ball_normals(size)
     reflected = 2 * normal[..., :1] * normal - np.array([1.0, 0.0, 0.0])
     return light.radiance(reflected) * inside[..., None], inside.astype(np.float32)
+
+
+def ball_normals(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Normals [size, size, 3] of a ball seen from +x, and where it is [size, size]."""
+    centres = (np.arange(size) + 0.5) / size * 2 - 1
+    up, right = np.meshgrid(-centres, centres, indexing="ij")
+    toward = np.sqrt(np.maximum(1 - right**2 - up**2, 0))
+    # the camera looks along -x, so +y is to its right
+    return np.stack([toward, right, up], -1), right**2 + up**2 < 1
+
+
+def is_low_range(path: Path) -> bool:
+    """Whether a file is of a kind that cannot hold radiance above 1."""
+    return Path(path).suffix.lower() in _LDR_SUFFIXES
 
 
 def _area_shares(old: int, new: int) -> np.ndarray:

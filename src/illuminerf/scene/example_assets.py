@@ -8,10 +8,10 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import linear_from_srgb, to_uint8
 from illuminerf.scene.meshes import GLTF_FROM_WORLD, TriangleMesh, sphere_mesh
-from illuminerf.scene.procedural import ProceduralObject, duck_still_life, evening_light, studio_light
+from illuminerf.scene.named_lights import NAMED_LIGHTS
+from illuminerf.scene.procedural import ProceduralObject, duck_still_life
 from illuminerf.workflow.atomic import write_bytes
 
 _STILL_LIFE_NAMES = ("duck", "board", "ball", "cup")
@@ -36,28 +36,9 @@ def write_example_assets(folder: Path, resolution: int = 96, light_height: int =
         write_bytes(objects / f"{name}.glb", _colored_glb(item))
     write_bytes(objects / "torus.glb", _textured_torus_glb())
     _pebble().save_glb(objects / "pebble.glb")
-    for light in (studio_light, evening_light, lamps_light, overcast_light):
-        made = light(light_height)
-        made.save(lights / f"{made.name}.exr")
+    for name, light in NAMED_LIGHTS.items():
+        light.make(light_height).save(lights / f"{name}.exr")
     return objects, lights
-
-
-def lamps_light(height: int = 128) -> EnvironmentMap:
-    """Three small bright lamps of different tints in a dim room."""
-    directions = EnvironmentMap(np.ones((height, 2 * height, 3), np.float32), "lamps").directions()
-    image = np.full(directions.shape, 0.05)
-    for azimuth, elevation, tint in ((-1.9, 0.8, (1, 0.9, 0.8)), (0.5, 0.5, (0.8, 0.9, 1)), (1.9, -0.2, (1, 1, 1))):
-        flat = np.cos(elevation)
-        centre = np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)])
-        image[directions @ centre > np.cos(0.1)] = 60 * np.array(tint)
-    return EnvironmentMap(image.astype(np.float32), "lamps")
-
-
-def overcast_light(height: int = 128) -> EnvironmentMap:
-    """A grey sky, brightest at the zenith, over darker green ground."""
-    up = EnvironmentMap(np.ones((height, 2 * height, 3), np.float32), "overcast").directions()[..., 2:]
-    sky = np.array([0.85, 0.92, 1.0]) * (1 + 2 * np.maximum(up, 0)) / 2.2
-    return EnvironmentMap(np.where(up > 0, sky, np.array([0.10, 0.14, 0.07])).astype(np.float32), "overcast")
 
 
 def _colored_glb(item: ProceduralObject) -> bytes:

@@ -1,0 +1,1 @@
+"""`illuminerf view`: a finished run in the browser."""
