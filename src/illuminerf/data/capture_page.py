@@ -21,7 +21,8 @@ _OUTLINE, _PALE = np.array([255, 40, 120], np.uint8), 0.5
 _PAGE_STYLE = (
     STYLE
     + """
-#world { width: 100%; height: 28rem; border: 1px solid var(--line); border-radius: 6px; touch-action: none; cursor: grab }
+#world { width: 100%; height: 28rem; border: 1px solid var(--line); border-radius: 6px; cursor: grab }
+#world { touch-action: none }
 .row img { height: auto; width: 9.5rem } figure:target { outline: 3px solid #ff2878; border-radius: 6px }
 ul.warnings { border-left: 4px solid #e0a000; padding: .4rem 0 .4rem 2rem }
 p.good { border-left: 4px solid #30a050; padding: .4rem 1rem }
@@ -114,9 +115,9 @@ def capture_page(title: str, quality: Quality, warnings: Sequence[str], notes: S
         f"<p class=note>{len(quality.names)} of {quality.num_photographs} photographs placed. "
         f"{html.escape(' '.join(notes))}</p>",
         _warnings(warnings),
-        "<h2>Cameras and points</h2><canvas id=world></canvas><p class=note>Drag to turn, wheel to zoom, click a camera to "
-        "see its photograph. The ring is the unit circle on the ground plane through the middle of the object: z must "
-        "point up, and the points must look like the object.</p>",
+        "<h2>Cameras and points</h2><canvas id=world></canvas><p class=note>Drag to turn, wheel to zoom, click a "
+        "camera to see its photograph. The ring is the unit circle on the ground plane through the middle: z "
+        "must point up, and the points must look like the object.</p>",
         f"<script id=cameras type='application/json'>{_world(shown)}</script>",
         "<h2>Masks</h2><p class=note>What lies inside the line is taken for the object.</p>",
         _photographs(quality, shown),

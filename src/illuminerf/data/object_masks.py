@@ -1,6 +1,6 @@
-"""Which pixels of photographs without poses show the object: masks that are given, alpha, a plain backdrop, or a network.
+"""Which pixels of photographs without poses show the object: by given masks, alpha, a plain backdrop, or a network.
 
-Whatever the source, it ends as what `developing.develop` reads: a mask file per frame, alpha in the image, or a backdrop.
+Whatever the source, it ends as what `developing.develop` reads: a mask file per frame, alpha, or a backdrop.
 """
 
 import dataclasses

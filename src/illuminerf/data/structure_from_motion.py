@@ -1,9 +1,9 @@
 """Camera poses from photographs alone, by COLMAP through pycolmap (extra `capture`).
 
-Local features are found in every photograph, matched between all pairs (or neighbours in the order of taking), and cameras
-are added one after another while all of them are adjusted together (Schoenberger and Frahm 2016). What few features or a
-plain background starve is tried again: with lower thresholds for adding a camera, with features that stand oblique views
-better, and by solving for all cameras at once. The attempt that places most photographs is kept.
+Local features are found in every photograph, matched between all pairs (or neighbours in the order of taking), and
+cameras are added one after another while all of them are adjusted together (Schoenberger and Frahm 2016). What few
+features or a plain background starve is tried again: with lower thresholds for adding a camera, with features that
+stand oblique views better, and by solving for all cameras at once. The attempt that places most photographs is kept.
 """
 
 import importlib
@@ -147,8 +147,8 @@ def solve(images: Sequence[MatchingImage], folder: Path, config: SolverConfig) -
             "the photographs do not fit together",
             got=f"{len(best.cameras) if best else 0} of {len(images)} placed by {config.max_attempts} attempts",
             wanted="3 at the least, nearly all in a good capture",
-            fix="take more photographs with smaller steps (10 degrees), sharp, with the object or a patterned mat below it "
-            "filling the image; with a turntable set match to object, else to everything",
+            fix="take more photographs with smaller steps (10 degrees), sharp, with the object, or a patterned mat "
+            "below it, filling the image; with a turntable set match to object, else to everything",
         )
     return best
 

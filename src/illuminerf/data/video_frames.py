@@ -18,8 +18,8 @@ from illuminerf.workflow.progress import say, track
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 _JUDGED_SIDE = 640
 """Pixels of the longest side at which sharpness is measured: blur that is smaller does no harm."""
-_SEARCHED_SHARE = 0.6
-"""Of each window, so that no two frames are neighbours."""
+_MARGIN = 0.2
+"""Of each window, at both ends, that is not searched, so that no two frames are neighbours."""
 
 
 def sharpness(grey: np.ndarray) -> float:
@@ -36,14 +36,11 @@ def sharpest_of_windows(values: Sequence[float], count: int) -> list[int]:
     """
     if len(values) <= count:
         return list(range(len(values)))
-    edges = np.linspace(0, len(values), count + 1)
     chosen = []
-    for start, end in zip(edges[:-1], edges[1:], strict=True):
-        margin = (1 - _SEARCHED_SHARE) / 2 * (end - start)
-        first, last = int(np.ceil(start + margin)), int(np.ceil(end - margin))
-        first = min(first, int(start + (end - start) / 2))
-        window = np.asarray(values[first : max(last, first + 1)])
-        chosen.append(first + int(window.argmax()))
+    for window in np.array_split(np.arange(len(values)), count):
+        margin = int(_MARGIN * len(window))
+        searched = window[margin : len(window) - margin]
+        chosen.append(int(searched[np.asarray(values)[searched].argmax()]))
     return chosen
 
 

@@ -81,8 +81,8 @@ def angles_degrees(rotation: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def up_axis(world_from_camera: np.ndarray) -> np.ndarray:
-    """The unit vector [3] most nearly perpendicular to the right axes of all cameras [views, 4, 4], on the side of their
-    up axes.
+    """The unit vector [3] most nearly perpendicular to the right axes of all cameras [views, 4, 4], on the side of
+    their up axes.
 
     Distances to a plane are summed, not their squares, so that a few photographs taken on their side do not turn it.
     Cameras that all look one way leave it open; then it is as near to their mean up axis as it can be.

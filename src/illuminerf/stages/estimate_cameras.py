@@ -1,7 +1,7 @@
 """Photographs or a video -> Capture, with a page to check it by.
 
-Masks are settled, poses estimated by structure from motion, the world is turned upright and brought to the unit ball, and
-the photographs are undistorted and cut out. What could not be placed is left out and named.
+Masks are settled, poses estimated by structure from motion, the world is turned upright and brought to the unit ball,
+and the photographs are undistorted and cut out. What could not be placed is left out and named.
 
 capture.json, cameras.json, images/<000>.png    the capture, as import_capture writes it
 check.html                                      cameras in 3D, outlines over photographs, warnings
@@ -78,8 +78,8 @@ def run(photographs: Path, config: Config, out: Path) -> Path:
     """Estimate the cameras of `photographs`, a folder or a video, and write the capture to `out`.
 
     Raises:
-        UserError: before anything is written, where there are too few photographs, masks are missing, or poses cannot be
-            estimated.
+        UserError: before anything is written, where there are too few photographs, masks are missing, or poses cannot
+            be estimated.
     """
     load_pycolmap()
     with tempfile.TemporaryDirectory(prefix="illuminerf_") as temporary:
