@@ -4,8 +4,8 @@
 
 SCENE is any posed folder that import-capture reads. Its images are copied without their poses, `illuminerf capture`
 runs on them, and the found cameras are brought to the true ones by the best similarity of their centres. Rotation
-errors are in degrees, position errors in parts of the cameras' mean distance from where they look. `up_degrees` is the angle
-between the vertical that was guessed and the true one.
+errors are in degrees, position errors in parts of the cameras' mean distance from where they look. `up_degrees` is the
+angle between the vertical that was guessed and the true one.
 """
 
 import argparse
