@@ -20,7 +20,6 @@ from illuminerf.workflow.progress import say
 
 ENOUGH = 0.95
 """Share of the photographs that must be placed for no further attempt."""
-_SECONDS_PER_PAIR = 0.1  # on one thread, for some 2000 features each
 _NEIGHBOURS = 12
 
 
