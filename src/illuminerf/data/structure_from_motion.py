@@ -313,8 +313,8 @@ def _solved_camera(image: Any, model: Any) -> SolvedCamera:
         focal, cx, cy, k1 = values
         intrinsics, distortion = (focal, focal, cx, cy), (k1, 0.0, 0.0, 0.0, 0.0)
     else:  # OPENCV
-        fx, fy, cx, cy, *coefficients = values
-        intrinsics, distortion = (fx, fy, cx, cy), (*coefficients, 0.0)
+        fx, fy, cx, cy, k1, k2, p1, p2 = values
+        intrinsics, distortion = (fx, fy, cx, cy), (k1, k2, p1, p2, 0.0)
     seen = [model.point3D(point.point3D_id).xyz for point in image.points2D if point.has_point3D()]
     shown = [point.xy for point in image.points2D if point.has_point3D()]
     error = float("nan")
