@@ -13,7 +13,8 @@ from illuminerf.data import structure_from_motion
 from illuminerf.data.matching_images import feature_mask, write_matching_images
 from illuminerf.data.object_masks import settle_masks
 from illuminerf.data.photographs import photographs_of
-from illuminerf.data.structure_from_motion import MatchingImage, Solved, SolvedCamera, SolverConfig, solve
+from illuminerf.data.solved_cameras import Solved, SolvedCamera
+from illuminerf.data.structure_from_motion import MatchingImage, SolverConfig, solve
 from illuminerf.data.world_alignment import pose_errors, similarity_between, up_axis
 from illuminerf.workflow.errors import UserError
 from tests.data.photographed import ring_cameras, write_photographs

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from illuminerf.data.capture import load_capture
 from illuminerf.data.capture_warnings import Quality, largest_gap, warnings_of
-from illuminerf.data.structure_from_motion import MatchingImage, Solved, SolvedCamera, SolverConfig
+from illuminerf.data.solved_cameras import Solved, SolvedCamera
+from illuminerf.data.structure_from_motion import MatchingImage, SolverConfig
 from illuminerf.data.world_alignment import Similarity, pose_errors
 from illuminerf.stages import estimate_cameras, import_capture
 from illuminerf.stages.estimate_cameras import Config

@@ -24,8 +24,9 @@ from illuminerf.data.matching_images import Matched, small_photograph, write_mat
 from illuminerf.data.object_masks import Masked, MaskSource, settle_masks
 from illuminerf.data.photographs import photographs_of, read_shot
 from illuminerf.data.placement import Ball, focus_ball, hull_ball, mask_preview
+from illuminerf.data.solved_cameras import Solved
 from illuminerf.data.source import SourceCapture, SourceFrame
-from illuminerf.data.structure_from_motion import Solved, SolverConfig, load_pycolmap, solve
+from illuminerf.data.structure_from_motion import SolverConfig, load_pycolmap, solve
 from illuminerf.data.video_frames import sharpness
 from illuminerf.data.world_alignment import Similarity, levelled, up_axis
 from illuminerf.scene.cameras import Cameras
