@@ -8,6 +8,7 @@ stand oblique views better, and by solving for all cameras at once. The attempt 
 
 import importlib
 import shutil
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ ENOUGH = 0.95
 _NEIGHBOURS = 12
 _RELIABLE_PIXELS = 0.5
 """Reprojection errors well beyond this are put down to wrong matches."""
+_ENOUGH_POINTS = 30
 
 
 @dataclass(frozen=True)
@@ -238,7 +240,14 @@ class _Solver:
         return solved_from(largest, self.names, name)
 
     def _adjust_robustly(self, model: Any) -> None:
-        """All cameras and points once more, under a loss that wrong matches hardly count in."""
+        """All cameras and points once more, under a loss that wrong matches hardly count in. Points that only two
+        cameras see check nothing, so they go where both have enough others."""
+        points = {number: model.point3D(number) for number in model.point3D_ids()}
+        tracks = {number: {seen.image_id for seen in point.track.elements} for number, point in points.items()}
+        checked = Counter(image for track in tracks.values() if len(track) > 2 for image in track)
+        for number, track in tracks.items():
+            if len(track) < 3 and all(checked[image] >= _ENOUGH_POINTS for image in track):
+                model.delete_point3D(number)
         options = self.colmap.BundleAdjustmentOptions()
         options.ceres.loss_function_type = self.colmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = _RELIABLE_PIXELS
