@@ -27,6 +27,7 @@ from illuminerf.data.object_collection import read_ids
 from illuminerf.presets import PRESETS, Preset, customised
 from illuminerf.scene.example_assets import write_example_assets
 from illuminerf.stages import (
+    estimate_cameras,
     estimate_geometry,
     estimate_illumination,
     evaluate_relighting,
@@ -235,6 +236,12 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "demo": demo_command,
     "presets": presets_command,
     "view": view_command,
+    "capture": _stage(
+        estimate_cameras.run,
+        estimate_cameras.Config,
+        "Make a capture from photographs without poses, or from a video: poses, masks, and a page to check them by.",
+        {"photographs": Path},
+    ),
     "import-capture": _stage(
         import_capture.run,
         import_capture.Config,

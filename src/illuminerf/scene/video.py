@@ -1,8 +1,9 @@
 """Frames to MP4 and back."""
 
+import math
 import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -61,9 +62,34 @@ def read_video(path: Path, size: int) -> Iterator[np.ndarray]:
     Raises:
         UserError: it cannot be decoded to its end.
     """
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path)]
-    command += ["-vf", f"scale={size}:{size}:flags=area", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-    num_bytes = size * size * 3
+    return _decoded(path, ["-vf", f"scale={size}:{size}:flags=area"], (size, size, 3))
+
+
+def read_grey_video(path: Path, width: int, height: int) -> Iterator[np.ndarray]:
+    """Every frame that is stored, as uint8 [height, width], area-averaged.
+
+    Raises:
+        UserError: it cannot be decoded to its end.
+    """
+    options = ["-vf", f"scale={width}:{height}:flags=area,format=gray", "-fps_mode", "passthrough"]
+    return _decoded(path, options, (height, width), "gray")
+
+
+def read_chosen_frames(path: Path, chosen: Sequence[int]) -> Iterator[np.ndarray]:
+    """The frames of these numbers, counted as `read_grey_video` does, in full size: uint8 [height, width, 3].
+
+    Raises:
+        UserError: it cannot be decoded to its end.
+    """
+    width, height = video_size(path)
+    wanted = "+".join(f"eq(n\\,{number})" for number in chosen)
+    return _decoded(path, ["-vf", f"select={wanted}", "-fps_mode", "passthrough"], (height, width, 3))
+
+
+def _decoded(path: Path, options: list[str], shape: tuple[int, ...], pixels: str = "rgb24") -> Iterator[np.ndarray]:
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path), *options]
+    command += ["-f", "rawvideo", "-pix_fmt", pixels, "-"]
+    num_bytes = math.prod(shape)
     with (
         tempfile.TemporaryFile() as messages,
         subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=messages) as process,
@@ -71,7 +97,7 @@ def read_video(path: Path, size: int) -> Iterator[np.ndarray]:
         assert process.stdout is not None
         try:
             while len(frame := process.stdout.read(num_bytes)) == num_bytes:
-                yield np.frombuffer(frame, np.uint8).reshape(size, size, 3)
+                yield np.frombuffer(frame, np.uint8).reshape(shape)
         finally:  # also where the caller wants no more of them
             process.stdout.close()
             was_cut = process.poll() is None
