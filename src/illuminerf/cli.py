@@ -10,12 +10,24 @@ from typing import Annotated, Any, ClassVar
 import tyro
 from rich.markup import escape
 
-from illuminerf import ablation, benchmark, datasets, demo, models, orb_illumination_study, pipeline, stanford_orb
+from illuminerf import (
+    ablation,
+    benchmark,
+    datasets,
+    demo,
+    films,
+    models,
+    orb_illumination_study,
+    pipeline,
+    stanford_orb,
+)
 from illuminerf.data.objaverse_download import download_objaverse
 from illuminerf.data.object_collection import read_ids
 from illuminerf.presets import PRESETS, Preset, customised
+from illuminerf.run_folder import RunFolder
 from illuminerf.scene.example_assets import write_example_assets
 from illuminerf.stages import (
+    bake_relit_mesh,
     estimate_geometry,
     estimate_illumination,
     evaluate_relighting,
@@ -51,6 +63,7 @@ def relight_command(
     exposure: float = 0.0,
     background: str | None = None,
     model: str | None = None,
+    gif: bool = False,
 ) -> None:
     """Relight a capture: every stage of the method, from photographs to turntable, mesh and report.
 
@@ -67,13 +80,42 @@ def relight_command(
         exposure: Stops by which the light is made brighter.
         background: Plain background to cut away where the photographs have no masks: white or black.
         model: Another relighting model than the preset's: a folder, embedded or dilightnet.
+        gif: Also write each light's turntable as a GIF.
     """
     settings = customised(
         preset, samples=samples, size=size, seed=seed, device=device, rotate_degrees=rotate, exposure_stops=exposure,
         background=background, model=model,
     )  # fmt: skip
     pipeline.relight(capture, [pipeline.LightJob(path) for path in light], settings, out)
-    say(f"done: {out / 'report.html'}, {out / 'turntable.mp4'}, {out / 'mesh.glb'}")
+    for path in light if gif else ():
+        films.write_turntable_gif(RunFolder(out).light(path.stem))
+    say(f"done: {out / 'report.html'}, {out / 'turntable.mp4'}, {out / 'relit.glb'}")
+
+
+def render_command(
+    run: PositionalPath,
+    out: Path,
+    light: str | None = None,
+    cameras: Path | None = None,
+    size: int | None = None,
+    views: int = 72,
+    gif: bool = False,
+    device: str = "auto",
+) -> None:
+    """Render a finished run along a camera path or a turntable: PNG with alpha, linear EXR, MP4 and GIF.
+
+    Args:
+        run: What `illuminerf relight --out` named.
+        out: Folder for views/images/*.png, views/linear/*.exr, film.mp4 and film.gif.
+        light: Which of the run's lights (the name of its file); not needed where there is one.
+        cameras: cameras.json, transforms.json or nerfstudio's camera_path.json, in the world of the photographs' poses.
+        size: Longest side of the images in pixels; by default the camera file's own, else the photographs'.
+        views: Frames of the turntable where no cameras are given.
+        gif: Also write a GIF.
+        device: auto, cpu or cuda.
+    """
+    film = films.render(RunFolder(run), out, light, cameras, size, views, gif, device)
+    say(f"done: {film.video}, {len(film.frames)} views in {film.frames[0].parent}")
 
 
 def demo_command(out: Path = Path("runs/demo"), device: str = "auto", seed: int = 0) -> None:
@@ -195,6 +237,7 @@ def _stage(
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "relight": relight_command,
+    "render": render_command,
     "demo": demo_command,
     "presets": presets_command,
     "import-capture": _stage(
@@ -235,6 +278,12 @@ COMMANDS: dict[str, Callable[..., Any]] = {
         render_novel_views.Config,
         "Render a latent NeRF (or a geometry's own appearance) from a turntable or given cameras.",
         {"field": Path, "cameras": Path | None},
+    ),
+    "bake-relit-mesh": _stage(
+        bake_relit_mesh.run,
+        bake_relit_mesh.Config,
+        "Paint the mesh with a latent NeRF's colours: relit.glb (unlit texture) and relit.ply (a colour per vertex).",
+        {"field": Path, "geometry": Path, "capture": Path},
     ),
     "evaluate-relighting": _stage(
         evaluate_relighting.run,

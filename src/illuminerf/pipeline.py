@@ -5,7 +5,7 @@
     geometry + light --path tracer--> radiance cues                 once per light, from here on
     capture + own light + cues --relighting diffusion model--> S samples of every photograph
     samples + geometry --latent NeRF--> one relit object
-    relit object --render--> turntable, unseen views, scores
+    relit object --render--> turntable, unseen views, scores; --bake--> textured mesh
 
 Every line is one stage: a Config and a run(), which loads what is finished, goes on with what is not, and refuses
 what was made with other settings. Started again after a kill, this page continues where it stopped.
@@ -27,6 +27,7 @@ from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import read_png
 from illuminerf.scene.video import write_mp4
 from illuminerf.stages import (
+    bake_relit_mesh,
     estimate_geometry,
     estimate_illumination,
     evaluate_relighting,
@@ -80,6 +81,10 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
         say(f"light: {job.name}")
         folder = out / "lights" / job.name
         made = lights[job.name] = relight_under(capture, geometry, illumination, job.light, preset, folder)
+        if preset.relit_mesh is not None:
+            made["relit_mesh"] = bake_relit_mesh.run(
+                made["latent_nerf"], geometry, capture, preset.relit_mesh, folder / "relit_mesh"
+            )
         if job.test_cameras is not None:
             cameras = in_unit_ball(job.test_cameras, capture, folder / "test_cameras.json")
             made["test_views"] = render_novel_views.run(
@@ -92,6 +97,8 @@ def relight(source: Path, jobs: Sequence[LightJob], preset: Preset, out: Path) -
             scores[job.name] = read_metrics(made["scores"])
     first = lights[jobs[0].name]
     _copy(first["video"], out / "turntable.mp4")
+    if "relit_mesh" in first:
+        _copy(first["relit_mesh"] / "relit.glb", out / "relit.glb")
     write_report(out / "report.html", out, shared, lights, scores)
     return scores
 

@@ -8,6 +8,7 @@ from typing import Any
 from illuminerf.cues.renderer import CueSampling
 from illuminerf.fields.optimisation import OptimiserConfig
 from illuminerf.stages import (
+    bake_relit_mesh,
     estimate_geometry,
     estimate_illumination,
     evaluate_relighting,
@@ -39,6 +40,8 @@ class Preset:
     latent_nerf: fit_latent_nerf.Config = field(default_factory=fit_latent_nerf.Config)
     turntable: render_novel_views.Config = field(default_factory=render_novel_views.Config)
     test_views: render_novel_views.Config = field(default_factory=render_novel_views.Config)
+    relit_mesh: bake_relit_mesh.Config | None = field(default_factory=bake_relit_mesh.Config)
+    """How the mesh gets its relit colours; None: it does not."""
     evaluation: evaluate_relighting.Config = field(default_factory=evaluate_relighting.Config)
 
 
@@ -164,4 +167,5 @@ def customised(
         latent_nerf=change(preset.latent_nerf, **common),
         turntable=change(preset.turntable, device=device),
         test_views=change(preset.test_views, device=device),
+        relit_mesh=preset.relit_mesh and change(preset.relit_mesh, device=device),
     )
