@@ -29,7 +29,7 @@ def detect_format(root: Path, split: str) -> CaptureFormat:
         "the capture folder holds no camera poses",
         got=f"{', '.join(inside) if inside else 'an empty folder'} in {root}",
         wanted="transforms.json, cameras.json or train_000/metadata.json beside the images",
-        fix="estimate the poses first (COLMAP, or `ns-process-data`), see docs/captures.md",
+        fix="estimate them first: `illuminerf capture` does, or COLMAP, or `ns-process-data`; see docs/captures.md",
     )
 
 

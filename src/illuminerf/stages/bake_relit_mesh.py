@@ -27,15 +27,17 @@ class Config:
     texels_per_edge: int = 1
     """Steps between texels along a triangle's shorter sides. 1 asks the field at the vertices only, which loses nothing
     while the mesh is as fine as the photographs, as the presets' are."""
-    num_directions: int = 3
+    num_directions: int = 2
     """Directions over which the colour of a point is averaged."""
+    num_samples: int = 8
+    """Samples along the short ray that gives a point its colour."""
     max_viewpoints: int = 16
     """Cameras of the capture that directions are chosen from."""
     device: str = "auto"
     """auto, cpu or cuda."""
 
     def __post_init__(self) -> None:
-        if min(self.texels_per_edge, self.num_directions, self.max_viewpoints) < 1:
+        if min(self.texels_per_edge, self.num_directions, self.max_viewpoints) < 1 or self.num_samples < 2:
             raise UserError("texels, directions and viewpoints must be positive", got=str(self))
 
 
@@ -62,6 +64,8 @@ def run(latent_nerf_path: Path, geometry_path: Path, capture_path: Path, config:
             return out
         mesh = TriangleMesh.load_glb(geometry_path / "mesh.glb")
         stored = load_field(latent_nerf_path, resolve_device(config.device))
+        few = {"num_samples": config.num_samples, "num_proposal_samples": 2 * config.num_samples}
+        stored.field.config = replace(stored.field.config, **few)
         cameras = Cameras.from_dict(read_json(capture_path / "cameras.json"))
         chosen = np.unique(np.linspace(0, len(cameras) - 1, config.max_viewpoints).round().astype(int))
         viewpoints = cameras.positions[chosen]
