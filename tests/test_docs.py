@@ -91,7 +91,7 @@ def parse(arguments: list[str]) -> None:
     table: dict[str, Callable[..., Any]] = cli.COMMANDS
     if arguments[0] in cli.GROUPS:
         table, arguments = cli.GROUPS[arguments[0]], arguments[1:]
-    chosen = {name: idle(command) for name, command in table.items() if name in arguments[:1] or len(table) < 2}
+    chosen = {name: idle(command) for name, command in table.items() if name in arguments[:1]}
     if not chosen:
         raise SystemExit(f"no subcommand {arguments[:1]}")
     chosen["none"] = lambda: None  # one subcommand alone would not be named

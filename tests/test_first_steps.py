@@ -116,3 +116,4 @@ def test_the_wrong_run_or_light(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such light"):
         RunFolder(tmp_path).light("dawn")
     assert RunFolder(tmp_path).light("city").video.name == "turntable.mp4"
+    assert Path(RunFolder(tmp_path)) == tmp_path

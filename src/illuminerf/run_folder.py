@@ -71,6 +71,14 @@ class RunFolder:
     folder: Path
     """What was given as `out`."""
 
+    def __fspath__(self) -> str:
+        return str(self.folder)
+
+    @property
+    def relit_mesh(self) -> Path:
+        """The object with the first light's colours: binary glTF, y-up, unlit texture."""
+        return self.folder / "relit.glb"
+
     @property
     def report(self) -> Path:
         """One HTML page with everything to look at."""
