@@ -52,7 +52,7 @@ def relight(
 
     Returns:
         The paths of everything: `.report`, `.video`, `.mesh`, `.photographs`, and in `.lights["sunset"]` that light's
-        `.video`, `.mesh` (relit, textured), `.ply`, `.frames`, `.radiance`, `.cues` and `.samples`.
+        `.video`, `.mesh` (relit), `.ply`, `.frames`, `.radiance`, `.cues` and `.samples`.
 
     Raises:
         illuminerf.workflow.errors.UserError: bad input, or `out` was made with other settings.

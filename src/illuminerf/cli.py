@@ -282,7 +282,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "bake-relit-mesh": _stage(
         bake_relit_mesh.run,
         bake_relit_mesh.Config,
-        "Paint the mesh with a latent NeRF's colours: relit.glb (unlit texture) and relit.ply (a colour per vertex).",
+        "Paint the mesh with a latent NeRF's colours: relit.glb (unlit) and relit.ply.",
         {"field": Path, "geometry": Path, "capture": Path},
     ),
     "evaluate-relighting": _stage(

@@ -5,7 +5,7 @@
     geometry + light --path tracer--> radiance cues                 once per light, from here on
     capture + own light + cues --relighting diffusion model--> S samples of every photograph
     samples + geometry --latent NeRF--> one relit object
-    relit object --render--> turntable, unseen views, scores; --bake--> textured mesh
+    relit object --render--> turntable, unseen views, scores; --bake--> coloured mesh
 
 Every line is one stage: a Config and a run(), which loads what is finished, goes on with what is not, and refuses
 what was made with other settings. Started again after a kill, this page continues where it stopped.

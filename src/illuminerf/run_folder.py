@@ -30,7 +30,7 @@ class RelitObject:
 
     @property
     def mesh(self) -> Path:
-        """The object with its relit colours: binary glTF, y-up, unlit texture."""
+        """The object with its relit colours: binary glTF, y-up, unlit, a colour per vertex."""
         return self.folder / "relit_mesh" / "relit.glb"
 
     @property
@@ -76,7 +76,7 @@ class RunFolder:
 
     @property
     def relit_mesh(self) -> Path:
-        """The object with the first light's colours: binary glTF, y-up, unlit texture."""
+        """The object with the first light's colours: binary glTF, y-up, unlit, a colour per vertex."""
         return self.folder / "relit.glb"
 
     @property

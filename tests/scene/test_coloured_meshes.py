@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from illuminerf.scene.coloured_meshes import save_coloured_ply, save_textured_glb
+from illuminerf.scene.coloured_meshes import save_coloured_glb, save_coloured_ply, save_textured_glb
+from illuminerf.scene.images import linear_from_srgb
 from illuminerf.scene.meshes import GLTF_FROM_WORLD, TriangleMesh, sphere_mesh
 from illuminerf.scene.triangle_atlas import TriangleAtlas
 from illuminerf.workflow.errors import UserError
@@ -74,6 +75,22 @@ def test_glb_is_unlit_y_up_and_its_texture_is_srgb(tmp_path: Path) -> None:
     world = np.asarray(read.vertices) @ GLTF_FROM_WORLD
     np.testing.assert_allclose(bilinear(picture, uv), colour_at(world), atol=6e-3)
     assert np.abs(bilinear(picture, uv) - colour_at(np.asarray(read.vertices))).max() > 0.1, "axes must matter"
+
+
+def test_vertex_colours_are_linear_as_gltf_demands(tmp_path: Path) -> None:
+    mesh = sphere_mesh(2)
+    srgb = colour_at(mesh.vertices)
+    save_coloured_glb(tmp_path / "a.glb", TriangleMesh(mesh.vertices, mesh.faces, mesh.vertex_normals, srgb))
+    (read,) = trimesh.load_scene(tmp_path / "a.glb", process=False).geometry.values()
+    np.testing.assert_allclose(np.asarray(read.vertices) @ GLTF_FROM_WORLD, mesh.vertices, atol=1e-6)
+    np.testing.assert_array_equal(read.faces, mesh.faces)
+    raw = (tmp_path / "a.glb").read_bytes()
+    length = int.from_bytes(raw[12:16], "little")
+    assert b"KHR_materials_unlit" in raw[:length]
+    start = 20 + length + 8 + mesh.vertices.size * 4
+    stored = np.frombuffer(raw, "<u2", len(mesh.vertices) * 4, start).reshape(-1, 4) / 65535
+    np.testing.assert_allclose(stored[:, :3], linear_from_srgb(srgb), atol=1e-4)
+    assert np.abs(stored[:, :3] - srgb).max() > 0.1 and (stored[:, 3] == 1).all()
 
 
 def test_glb_is_read_by_our_own_reader(tmp_path: Path) -> None:

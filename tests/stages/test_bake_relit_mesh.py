@@ -30,7 +30,9 @@ def test_colours_are_where_the_photographs_saw_them(
     painted = ply.visual.vertex_colors[:, :3] / 255
     assert np.sqrt(np.mean((painted - colour_of(ply.vertices)) ** 2)) < 0.08
     assert np.sqrt(np.mean((painted - colour_of(-ply.vertices)) ** 2)) > 0.2
-    (glb,) = trimesh.load_scene(out / "relit.glb", process=False).geometry.values()
+    (plain,) = trimesh.load_scene(out / "relit.glb", process=False).geometry.values()
+    np.testing.assert_allclose(np.asarray(plain.vertices) @ GLTF_FROM_WORLD, ply.vertices, atol=1e-5)
+    (glb,) = trimesh.load_scene(out / "textured.glb", process=False).geometry.values()
     picture = np.asarray(glb.visual.material.baseColorTexture.convert("RGB"), np.float32) / 255
     uv = np.asarray(glb.visual.uv) * [1, -1] + [0, 1]
     x, y = np.floor(uv * [picture.shape[1], picture.shape[0]]).astype(int).T

@@ -8,7 +8,7 @@ import numpy as np
 from illuminerf.fields.baking import surface_colours
 from illuminerf.fields.storage import StoredField, load_field
 from illuminerf.scene.cameras import Cameras
-from illuminerf.scene.coloured_meshes import save_coloured_ply, save_textured_glb
+from illuminerf.scene.coloured_meshes import save_coloured_glb, save_coloured_ply, save_textured_glb
 from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.scene.triangle_atlas import TriangleAtlas
 from illuminerf.workflow.artefact import open_artefact
@@ -24,9 +24,9 @@ _POINTS_AT_ONCE = 1 << 14
 class Config:
     """How colours are baked."""
 
-    texels_per_edge: int = 1
-    """Steps between texels along a triangle's shorter sides. 1 asks the field at the vertices only, which loses nothing
-    while the mesh is as fine as the photographs, as the presets' are."""
+    texels_per_edge: int = 0
+    """Steps between texels along a triangle's shorter sides in textured.glb; 0 leaves that file out. The presets'
+    meshes are as fine as the photographs, so that colours of vertices lose nothing."""
     num_directions: int = 2
     """Directions over which the colour of a point is averaged."""
     num_samples: int = 8
@@ -37,7 +37,7 @@ class Config:
     """auto, cpu or cuda."""
 
     def __post_init__(self) -> None:
-        if min(self.texels_per_edge, self.num_directions, self.max_viewpoints) < 1 or self.num_samples < 2:
+        if min(self.num_directions, self.max_viewpoints) < 1 or self.num_samples < 2 or self.texels_per_edge < 0:
             raise UserError("texels, directions and viewpoints must be positive", got=str(self))
 
 
@@ -49,7 +49,8 @@ def run(latent_nerf_path: Path, geometry_path: Path, capture_path: Path, config:
         geometry_path: the Geometry whose mesh.glb is painted.
         capture_path: the Capture; colours are those seen from about its cameras.
         config: the settings.
-        out: the RelitMesh artefact: relit.glb (y-up, unlit texture) and relit.ply (z-up, colour per vertex).
+        out: the RelitMesh artefact: relit.glb (y-up, unlit) and relit.ply (z-up) with a colour per vertex; with
+            texels_per_edge also textured.glb.
 
     Raises:
         UserError: something cannot be read, or the texture would be too large.
@@ -69,12 +70,14 @@ def run(latent_nerf_path: Path, geometry_path: Path, capture_path: Path, config:
         cameras = Cameras.from_dict(read_json(capture_path / "cameras.json"))
         chosen = np.unique(np.linspace(0, len(cameras) - 1, config.max_viewpoints).round().astype(int))
         viewpoints = cameras.positions[chosen]
-        atlas = TriangleAtlas(len(mesh.faces), config.texels_per_edge)
         mesh = replace(mesh, vertex_colors=_colours(stored, mesh.vertices, viewpoints, config.num_directions))
-        texture = _texture(stored, mesh, atlas, viewpoints, config.num_directions)
-        save_textured_glb(out / "relit.glb", mesh, atlas, texture)
+        save_coloured_glb(out / "relit.glb", mesh)
         save_coloured_ply(out / "relit.ply", mesh)
-        artefact.finish({"num_faces": len(mesh.faces), "texture": [atlas.width, atlas.height]})
+        if config.texels_per_edge:
+            atlas = TriangleAtlas(len(mesh.faces), config.texels_per_edge)
+            texture = _texture(stored, mesh, atlas, viewpoints, config.num_directions)
+            save_textured_glb(out / "textured.glb", mesh, atlas, texture)
+        artefact.finish({"num_faces": len(mesh.faces)})
     return out
 
 
