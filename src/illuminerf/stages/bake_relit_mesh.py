@@ -65,8 +65,8 @@ def run(latent_nerf_path: Path, geometry_path: Path, capture_path: Path, config:
             return out
         mesh = TriangleMesh.load_glb(geometry_path / "mesh.glb")
         stored = load_field(latent_nerf_path, resolve_device(config.device))
-        few = {"num_samples": config.num_samples, "num_proposal_samples": 2 * config.num_samples}
-        stored.field.config = replace(stored.field.config, **few)
+        count = config.num_samples
+        stored.field.config = replace(stored.field.config, num_samples=count, num_proposal_samples=2 * count)
         cameras = Cameras.from_dict(read_json(capture_path / "cameras.json"))
         chosen = np.unique(np.linspace(0, len(cameras) - 1, config.max_viewpoints).round().astype(int))
         viewpoints = cameras.positions[chosen]
