@@ -4,6 +4,7 @@ import os
 import shutil
 import stat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,12 +63,16 @@ def test_a_folder_with_spaces_and_umlauts_that_may_only_be_read(tmp_path: Path) 
 def test_no_permission_to_write(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def denied(*_: object, **__: object) -> None:
-        raise PermissionError(13, "Permission denied")
+    make = Path.mkdir
+
+    def denied(path: Path, *arguments: Any, **named: Any) -> None:
+        if path.is_relative_to("/locked"):
+            raise PermissionError(13, "Permission denied")
+        make(path, *arguments, **named)
 
     folder = photographs(tmp_path / "photos")
     monkeypatch.setattr(Path, "mkdir", denied)  # root may write everywhere
-    said = refused(["import-capture", str(folder), "--out", "/locked/run"], capsys)
+    said = refused(["import-capture", str(folder), "--size", "16", "--out", "/locked/run"], capsys)
     assert "/locked/run cannot be written" in said and "--out" in said
     with pytest.raises(UserError, match="cannot be written"), atomic.atomic_path(Path("/locked/a.json")):
         pass
@@ -78,7 +83,7 @@ def test_a_locked_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     (tmp_path / "locked").mkdir(mode=0o555)
     folder = photographs(tmp_path / "photos")
     assert "cannot be written" in refused(
-        ["import-capture", str(folder), "--out", str(tmp_path / "locked" / "run")], capsys
+        ["import-capture", str(folder), "--size", "16", "--out", str(tmp_path / "locked" / "run")], capsys
     )
 
 
