@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -18,6 +19,7 @@ from illuminerf.data.capture import load_capture
 from illuminerf.evaluation.benchmark_rule import score_light, view_pair
 from illuminerf.fields.mesh_fit import SurfaceRegressionConfig
 from illuminerf.presets import PRESETS, Preset, customised
+from illuminerf.run_folder import RunFolder
 from illuminerf.scene.images import read_png
 from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.stages import fit_latent_nerf, render_novel_views
@@ -76,7 +78,10 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_leaves_what_the_readme_promises(finished: Path) -> None:
     page = (finished / "report.html").read_text()
     assert "<video" in page and "http" not in page.replace("http-equiv", ""), "the report must open offline"
+    sources = re.findall(r"src='([^']{5})", page)
+    assert len(sources) > 10 and set(sources) == {"data:"}, "pictures and film must be inside"
     assert (finished / "turntable.mp4").stat().st_size > 500
+    assert (finished / "relit.glb").read_bytes() == RunFolder(finished).light().mesh.read_bytes()
     assert (finished / "mesh.glb").stat().st_size > 500
     assert len(list((finished / "lights/evening/relit/samples").glob("*.png"))) == NUM_VIEWS
 

@@ -1,5 +1,6 @@
 """Published benchmarks, reproduced by one command each."""
 
+import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -217,7 +218,7 @@ def relight_scene(
     test_cameras = out / scene.name / "test_cameras.json"
     write_json(test_cameras, cameras.to_dict())
     jobs = [pipeline.LightJob(_light(lights_dir, light), test_cameras) for light in lights]
-    pipeline.relight(scene, jobs, preset, out / scene.name)
+    pipeline.relight(scene, jobs, dataclasses.replace(preset, relit_mesh=None), out / scene.name)
     for light in lights:
         rendered = out / scene.name / "lights" / light / "test_views"
         write_predictions(rendered, names, out / "predictions" / scene.name / light)

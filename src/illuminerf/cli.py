@@ -15,6 +15,7 @@ from illuminerf import (
     benchmark,
     datasets,
     demo,
+    films,
     geometry_benchmark,
     lights,
     models,
@@ -25,8 +26,10 @@ from illuminerf import (
 from illuminerf.data.objaverse_download import download_objaverse
 from illuminerf.data.object_collection import read_ids
 from illuminerf.presets import PRESETS, Preset, customised
+from illuminerf.run_folder import RunFolder
 from illuminerf.scene.example_assets import write_example_assets
 from illuminerf.stages import (
+    bake_relit_mesh,
     estimate_cameras,
     estimate_geometry,
     estimate_illumination,
@@ -68,6 +71,7 @@ def relight_command(
     model: str | None = None,
     mesh: Path | None = None,
     ldr_peak: float = 1.0,
+    gif: bool = False,
 ) -> None:
     """Relight a capture: every stage of the method, from photographs to turntable, mesh and report.
 
@@ -87,6 +91,7 @@ def relight_command(
         model: Another relighting model than the preset's: a folder, embedded or dilightnet.
         mesh: A .glb, .obj or .ply mesh in the capture's world that takes the place of estimated geometry.
         ldr_peak: Radiance that the white of a PNG or JPEG light stands for; 1 takes it as it is.
+        gif: Also write each light's turntable as a GIF.
     """
     settings = customised(
         preset, samples=samples, size=size, seed=seed, device=device, rotate_degrees=rotate, exposure_stops=exposure,
@@ -94,7 +99,35 @@ def relight_command(
     )  # fmt: skip
     jobs = [pipeline.LightJob(path, ldr_peak=ldr_peak) for path in light]
     pipeline.relight(capture, jobs, settings, out, mesh)
-    say(f"done: {out / 'report.html'}, {out / 'turntable.mp4'}, {out / 'mesh.glb'}")
+    for path in light if gif else ():
+        films.write_turntable_gif(RunFolder(out).light(path.stem))
+    say(f"done: {out / 'report.html'}, {out / 'turntable.mp4'}, {out / 'relit.glb'}")
+
+
+def render_command(
+    run: PositionalPath,
+    out: Path,
+    light: str | None = None,
+    cameras: Path | None = None,
+    size: int | None = None,
+    views: int = 72,
+    gif: bool = False,
+    device: str = "auto",
+) -> None:
+    """Render a finished run along a camera path or a turntable: PNG with alpha, linear EXR, MP4 and GIF.
+
+    Args:
+        run: What `illuminerf relight --out` named.
+        out: Folder for views/images/*.png, views/linear/*.exr, film.mp4 and film.gif.
+        light: Which of the run's lights (the name of its file); not needed where there is one.
+        cameras: cameras.json, transforms.json or nerfstudio's camera_path.json, in the world of the photographs' poses.
+        size: Longest side of the images in pixels; by default the camera file's own, else the photographs'.
+        views: Frames of the turntable where no cameras are given.
+        gif: Also write a GIF.
+        device: auto, cpu or cuda.
+    """
+    film = films.render(RunFolder(run), out, light, cameras, size, views, gif, device)
+    say(f"done: {film.video}, {len(film.frames)} views in {film.frames[0].parent}")
 
 
 def demo_command(out: Path = Path("runs/demo"), device: str = "auto", seed: int = 0) -> None:
@@ -233,6 +266,7 @@ def _stage(
 
 COMMANDS: dict[str, Callable[..., Any]] = {
     "relight": relight_command,
+    "render": render_command,
     "demo": demo_command,
     "presets": presets_command,
     "view": view_command,
@@ -286,6 +320,12 @@ COMMANDS: dict[str, Callable[..., Any]] = {
         render_novel_views.Config,
         "Render a latent NeRF (or a geometry's own appearance) from a turntable or given cameras.",
         {"field": Path, "cameras": Path | None},
+    ),
+    "bake-relit-mesh": _stage(
+        bake_relit_mesh.run,
+        bake_relit_mesh.Config,
+        "Paint the mesh with a latent NeRF's colours: relit.glb (unlit) and relit.ply.",
+        {"field": Path, "geometry": Path, "capture": Path},
     ),
     "evaluate-relighting": _stage(
         evaluate_relighting.run,

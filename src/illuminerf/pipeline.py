@@ -5,7 +5,7 @@
     geometry + light --path tracer--> radiance cues                 once per light, from here on
     capture + own light + cues --relighting diffusion model--> S samples of every photograph
     samples + geometry --latent NeRF--> one relit object
-    relit object --render--> turntable, unseen views, scores
+    relit object --render--> turntable, unseen views, scores; --bake--> coloured mesh
 
 Every line is one stage: a Config and a run(), which loads what is finished, goes on with what is not, and refuses
 what was made with other settings. Started again after a kill, this page continues where it stopped.
@@ -28,6 +28,7 @@ from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.scene.named_lights import find_light, light_file
 from illuminerf.scene.video import write_mp4
 from illuminerf.stages import (
+    bake_relit_mesh,
     estimate_geometry,
     estimate_illumination,
     evaluate_relighting,
@@ -89,6 +90,10 @@ def relight(
         folder = out / "lights" / job.name
         light = light_file(job.light, folder, job.ldr_peak)
         made = lights[job.name] = relight_under(capture, geometry, illumination, light, preset, folder)
+        if preset.relit_mesh is not None:
+            made["relit_mesh"] = bake_relit_mesh.run(
+                made["latent_nerf"], geometry, capture, preset.relit_mesh, folder / "relit_mesh"
+            )
         if job.test_cameras is not None:
             cameras = in_unit_ball(job.test_cameras, capture, folder / "test_cameras.json")
             made["test_views"] = render_novel_views.run(
@@ -101,6 +106,8 @@ def relight(
             scores[job.name] = read_metrics(made["scores"])
     first = lights[jobs[0].name]
     _copy(first["video"], out / "turntable.mp4")
+    if "relit_mesh" in first:
+        _copy(first["relit_mesh"] / "relit.glb", out / "relit.glb")
     write_report(out / "report.html", out, shared, lights, scores)
     return scores
 

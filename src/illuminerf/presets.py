@@ -12,6 +12,7 @@ from illuminerf.fields.optimisation import OptimiserConfig
 from illuminerf.fields.radiance_field import FieldConfig
 from illuminerf.fields.surface import SurfaceConfig
 from illuminerf.stages import (
+    bake_relit_mesh,
     estimate_geometry,
     estimate_illumination,
     evaluate_relighting,
@@ -45,6 +46,8 @@ class Preset:
     latent_nerf: fit_latent_nerf.Config = field(default_factory=fit_latent_nerf.Config)
     turntable: render_novel_views.Config = field(default_factory=render_novel_views.Config)
     test_views: render_novel_views.Config = field(default_factory=render_novel_views.Config)
+    relit_mesh: bake_relit_mesh.Config | None = field(default_factory=bake_relit_mesh.Config)
+    """How the mesh gets its relit colours; None: it does not."""
     evaluation: evaluate_relighting.Config = field(default_factory=evaluate_relighting.Config)
     materials: fit_materials.Config = field(default_factory=fit_materials.Config)
     """Of the alternative that benchmarks compare with, as is the next."""
@@ -182,4 +185,5 @@ def customised(
         test_views=change(preset.test_views, device=device),
         materials=change(preset.materials, seed=seed, fit=change(preset.materials.fit, device=device)),
         material_views=change(preset.material_views, **common),
+        relit_mesh=preset.relit_mesh and change(preset.relit_mesh, device=device),
     )

@@ -1,4 +1,4 @@
-"""Frames to MP4 and back."""
+"""Frames to MP4 and back, and to GIF."""
 
 import math
 import subprocess
@@ -9,6 +9,7 @@ from pathlib import Path
 import imageio.v2 as imageio
 import imageio_ffmpeg
 import numpy as np
+from PIL import Image
 
 from illuminerf.scene.images import to_uint8
 from illuminerf.workflow.atomic import atomic_path
@@ -39,6 +40,22 @@ def write_mp4(path: Path, frames: Iterable[np.ndarray], frames_per_second: int =
             writer.append_data(  # type: ignore[attr-defined]
                 np.ascontiguousarray(to_uint8(even))
             )
+
+
+def write_gif(path: Path, frames: Iterable[np.ndarray], frames_per_second: int = 24) -> None:
+    """Write sRGB frames, float [height, width, 3] in [0, 1], as a GIF that loops for ever, atomically.
+
+    All frames share the first one's palette, which keeps plain backgrounds still; players know hundredths of a second,
+    and slow down what is faster than fifty frames a second.
+    """
+    pictures = [Image.fromarray(to_uint8(frame)) for frame in frames]
+    if not pictures:
+        raise UserError(f"there are no frames for {path}")
+    palette = pictures[0].quantize(256, Image.Quantize.MEDIANCUT)
+    first, *others = [picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for picture in pictures]
+    milliseconds = max(20, round(100 / frames_per_second) * 10)
+    with atomic_path(path) as temporary:
+        first.save(temporary, "GIF", save_all=True, append_images=others, duration=milliseconds, loop=0, optimize=False)
 
 
 def video_size(path: Path) -> tuple[int, int]:

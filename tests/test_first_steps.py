@@ -1,0 +1,124 @@
+"""What a newcomer stumbles over: odd folders, narrow terminals, missing permissions, wrong files."""
+
+import os
+import shutil
+import stat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from illuminerf.cli import main
+from illuminerf.demo import bundled_capture
+from illuminerf.films import render
+from illuminerf.run_folder import RunFolder
+from illuminerf.scene.images import write_png
+from illuminerf.workflow import atomic, progress
+from illuminerf.workflow.errors import UserError
+
+LIGHT = bundled_capture() / "lights" / "evening.exr"
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    printed = " ".join(capsys.readouterr().err.split())
+    assert printed.count("error:") == 1 and "Traceback" not in printed
+    return printed.split("error:")[1]
+
+
+def photographs(folder: Path, count: int = 5) -> Path:
+    shutil.copytree(bundled_capture() / "images", folder / "images")
+    shutil.copy(bundled_capture() / "cameras.json", folder)
+    return folder
+
+
+def test_photographs_without_poses_are_told_where_poses_come_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number in range(4):
+        write_png(tmp_path / "photos" / f"IMG_{number}.png", np.ones((8, 8, 3)))
+    said = refused(["relight", str(tmp_path / "photos"), "--light", str(LIGHT), "--out", str(tmp_path / "run")], capsys)
+    assert "illuminerf capture" in said
+
+
+def test_a_folder_with_spaces_and_umlauts_that_may_only_be_read(tmp_path: Path) -> None:
+    folder = photographs(tmp_path / "Möbel und Öfen, 2. Versuch")
+    everything = [folder, *folder.rglob("*")]
+    for path in everything:
+        path.chmod(path.stat().st_mode & ~(stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH))
+    before = {path: path.stat().st_mtime_ns for path in everything}
+    try:
+        main(["import-capture", str(folder), "--size", "16", "--out", str(tmp_path / "Ergebnis é")])
+        assert (tmp_path / "Ergebnis é" / "DONE").is_file()
+        assert {path: path.stat().st_mtime_ns for path in [folder, *folder.rglob("*")]} == before
+    finally:
+        for path in everything:
+            path.chmod(path.stat().st_mode | stat.S_IWUSR)
+
+
+def test_no_permission_to_write(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = Path.mkdir
+
+    def denied(path: Path, *arguments: Any, **named: Any) -> None:
+        if path.is_relative_to("/locked"):
+            raise PermissionError(13, "Permission denied")
+        make(path, *arguments, **named)
+
+    folder = photographs(tmp_path / "photos")
+    monkeypatch.setattr(Path, "mkdir", denied)  # root may write everywhere
+    said = refused(["import-capture", str(folder), "--size", "16", "--out", "/locked/run"], capsys)
+    assert "/locked/run cannot be written" in said and "--out" in said
+    with pytest.raises(UserError, match="cannot be written"), atomic.atomic_path(Path("/locked/a.json")):
+        pass
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_locked_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "locked").mkdir(mode=0o555)
+    folder = photographs(tmp_path / "photos")
+    assert "cannot be written" in refused(
+        ["import-capture", str(folder), "--size", "16", "--out", str(tmp_path / "locked" / "run")], capsys
+    )
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_a_narrow_terminal_loses_nothing(
+    is_terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(
+        progress, "console", Console(stderr=True, width=60, force_terminal=is_terminal, soft_wrap=True, no_color=True)
+    )
+    path = "/a/very/long/folder/" * 6 + "report.html"
+    progress.say(f"done: {path}")
+    assert path in capsys.readouterr().err, "a path must be left in one piece, to be copied"
+    for _ in progress.track(range(3), "render novel views"):
+        pass
+    assert "3/3" in capsys.readouterr().err
+
+
+def test_a_picture_is_no_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "light.exr").write_text("not an EXR")
+    folder = photographs(tmp_path / "photos")
+    said = refused(
+        ["relight", str(folder), "--light", str(tmp_path / "light.exr"), "--out", str(tmp_path / "run")], capsys
+    )
+    assert "light.exr" in said and not (tmp_path / "run").exists()
+
+
+def test_the_wrong_run_or_light(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="is not a run"):
+        render(RunFolder(tmp_path), tmp_path / "out")
+    for name in ("city", "night"):
+        (tmp_path / "lights" / name).mkdir(parents=True)
+    with pytest.raises(UserError, match="city or night"):
+        RunFolder(tmp_path).light()
+    with pytest.raises(UserError, match="no such light"):
+        RunFolder(tmp_path).light("dawn")
+    assert RunFolder(tmp_path).light("city").video.name == "turntable.mp4"
+    assert Path(RunFolder(tmp_path)) == tmp_path
