@@ -38,7 +38,7 @@ from illuminerf.workflow.device import Precision, resolve_device, torch_generato
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import track
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.fields import (  # noqa: E402
     KERNEL_GRID,
     kernel_against_twin,
