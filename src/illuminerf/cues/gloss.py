@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from illuminerf.cues.renderer import CUE_NAMES, CueSampling, render_cues
-from illuminerf.cues.surface_samples import RayCaster, SurfacePoints, bilinear, sightings
+from illuminerf.cues.surface_samples import CLIPPED_SRGB, RayCaster, SurfacePoints, bilinear, sightings
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import linear_from_srgb
 from illuminerf.scene.meshes import TriangleMesh
@@ -26,7 +26,6 @@ from illuminerf.workflow.progress import track
 
 _DIELECTRIC_REFLECTANCE = 0.04
 _LOBE = CUE_NAMES.index("ggx_034")
-_OVEREXPOSED_SRGB = 0.985
 _LEAST_COVERAGE = 0.5
 _DARK = 0.02  # linear: noise and stray light matter as much as the colour
 _ROUNDS = 15
@@ -78,7 +77,7 @@ def estimated_gloss(
     for row, (view, cues) in enumerate(zip(chosen, track(rendered, "gloss", len(chosen)), strict=True)):
         seen = sightings(points, views, view, caster)
         values = bilinear(cues.transpose(1, 2, 0), seen.pixels)
-        is_good = (values[:, -1] > _LEAST_COVERAGE) & (seen.srgb < _OVEREXPOSED_SRGB).all(-1)
+        is_good = (values[:, -1] > _LEAST_COVERAGE) & (seen.srgb < CLIPPED_SRGB).all(-1)
         index, straight = seen.index[is_good], values[is_good, :-1] / values[is_good, -1:]
         colours[row, index] = linear_from_srgb(seen.srgb[is_good])
         diffuse[row, index], lobe[row, index] = straight[:, :3], straight[:, 3 * _LOBE : 3 * _LOBE + 3]

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from illuminerf.cues.differentiable_shading import DifferentiableShading
 from illuminerf.cues.materials import Material
+from illuminerf.cues.surface_samples import CLIPPED_SRGB
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
 from illuminerf.scene.meshes import TriangleMesh
@@ -25,7 +26,6 @@ from illuminerf.workflow.errors import UserError
 
 _SMOOTHEST = 0.08  # smaller roughness is a mirror: all noise at a few paths
 _OPAQUE = 0.98
-_CLIPPED_SRGB = 0.985
 _DARKEST = 0.02  # linear; errors of darker pixels do not count more
 _CHROMA_STIFFNESS = 4.0  # colour of light varies less than its brightness
 
@@ -164,7 +164,7 @@ def photometric_loss(
     slope = 0.43 * (wanted + _DARKEST) ** -0.58
     error = (radiance - wanted) * slope
     # what a photograph shows as white may be any brighter
-    error = torch.where((srgb > _CLIPPED_SRGB) & (error > 0), 0.0, error) * hit[:, None]
+    error = torch.where((srgb > CLIPPED_SRGB) & (error > 0), 0.0, error) * hit[:, None]
     weight = (1 + (error.detach() / config.robustness).square()).rsqrt()
     count = hit.sum().clamp_min(1) * 3
     with torch.no_grad():

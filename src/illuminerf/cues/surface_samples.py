@@ -20,7 +20,8 @@ _OFFSET = 4e-3  # of the unit ball: rays start this far above the surface, beyon
 _POINTS_FOR_NORMALS = 30_000
 _LEAST_COSINE = 0.2  # photographs that see a point at a flatter angle are not asked
 _OPAQUE = 0.98
-_CLIPPED_SRGB = 0.985
+CLIPPED_SRGB = 0.985
+"""Values above say only that the light was brighter than the photograph can show."""
 
 
 class RayCaster:
@@ -178,7 +179,7 @@ def seen_colors(
     # colours in sRGB sort as linear ones do
     if enough.any():
         result[enough] = np.nanquantile(colors[:, enough], quantile, axis=0)
-    result[(result > _CLIPPED_SRGB).any(-1)] = np.nan
+    result[(result > CLIPPED_SRGB).any(-1)] = np.nan
     return linear_from_srgb(result)
 
 
