@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+import illuminerf  # noqa: F401 - before any test imports torch, so that its threads wait as the package's do
+
 
 @pytest.fixture
 def data_root() -> Path:

@@ -18,6 +18,9 @@ __version__ = "0.1.0"
 # Waiting OpenMP threads that spin starve everybody, themselves included, once cores are shared: a geometry step took
 # fourteen times as long. Read when torch is imported; a value that is already set wins.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# numba takes every core, whatever torch was told (torchrun tells each process 1)
+if os.environ.get("OMP_NUM_THREADS", "").isdecimal():
+    os.environ.setdefault("NUMBA_NUM_THREADS", os.environ["OMP_NUM_THREADS"])
 
 
 def relight(
