@@ -96,8 +96,9 @@ def fits(config: FieldConfig, num_rays: int, seconds: float, device: torch.devic
     def latent(number: int) -> Tensor:
         generator = torch_generator(1, number, device=device)
         index = torch.randint(len(pool), (batch,), generator=generator, device=device)
+        within = torch.rand(batch, 2, generator=generator, device=device) - 0.5
         latents = torch.nn.functional.embedding(pool.view[index], codes)
-        return latent_loss(field, cache, index, srgb[index], latents, 1e-4)[0]
+        return latent_loss(field, cache, index, srgb[index], latents, 1e-4, within)[0]
 
     spent = seconds_per_call(training_step([*field.appearance.parameters(), codes], latent), seconds, device)
     return result | {"latent_rays_per_second": batch / spent, "latent_step_ms": 1e3 * spent}

@@ -208,8 +208,9 @@ def fits(
         index, image = (
             torch.randint(size, (rays,), generator=generator, device=device) for size in (len(covered), _IMAGES)
         )
+        within = torch.rand(rays, 2, generator=generator, device=device) - 0.5
         latents = torch.nn.functional.embedding(image, codes)
-        loss, _ = latent_loss(field, cache, index, srgb[index], latents, 1e-4)
+        loss, _ = latent_loss(field, cache, index, srgb[index], latents, 1e-4, within)
         last["loss"] = float(loss.detach())
         return loss
 

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import torch
 from torch.nn import functional
 
@@ -12,7 +13,7 @@ from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.proposal_sampling import ProposalConfig
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
 from illuminerf.fields.ray_pool import RayPool
-from illuminerf.fields.shading_cache import cache_shading, latent_loss
+from illuminerf.fields.shading_cache import cache_shading, latent_loss, steps_on_surface
 from illuminerf.fields.surface import SurfaceConfig
 from illuminerf.scene.cameras import turntable_cameras
 
@@ -98,6 +99,39 @@ def test_cached_colours_are_the_rendered_ones() -> None:
     fewer = cache_shading(field, pool, num_kept=1)
     assert not torch.allclose(fewer.render(field, index, latents), direct, atol=1e-4)
     torch.testing.assert_close(fewer.weights.sum(-1), cache.weights.sum(-1))
+
+
+def test_a_step_within_a_pixel_stays_on_the_surface_and_in_the_pixel() -> None:
+    pool = _pool(40)
+    index = torch.arange(40)
+    origins, directions, _, _ = pool.rays(index)
+    generator = torch.Generator().manual_seed(0)
+    normals = functional.normalize(-directions + 0.8 * torch.randn(40, 3, generator=generator), dim=-1)
+    facing = -(directions * normals).sum(-1)
+    assert float(facing.min()) < 0.3 < float(facing.median()) < 0.9, "slanted ones, and a few beyond the bound"
+    points, within = origins + 2.5 * directions, torch.rand(40, 2, generator=generator) - 0.5
+    side = 2.5 / float(pool.cameras.intrinsics[0, 0])
+    moved = points + steps_on_surface(within * side, directions, normals)
+    bounded = facing > 0.3
+    assert float(((moved - points) * normals).sum(-1)[bounded].abs().max()) < 1e-6
+    assert float(((moved - points) * normals).sum(-1)[~bounded].abs().max()) > 1e-4
+    camera = pool.cameras[[1]]
+    (before, _), (after, _) = (camera.project(each.numpy()) for each in (points, moved))
+    steps = np.linalg.norm(after[0] - before[0], axis=-1)
+    np.testing.assert_allclose(steps, within.norm(dim=-1).numpy(), rtol=0.1, atol=1e-3)
+    assert np.abs(steps - 2 * within.norm(dim=-1).numpy()).max() > 0.3, "the guard: of twice the length"
+
+
+def test_colours_within_a_pixel_are_others_and_those_in_its_middle_the_same() -> None:
+    torch.manual_seed(0)
+    field, pool = RadianceField(_FIELD), _pool(40)
+    index = torch.arange(40)
+    cache = cache_shading(field, pool, num_kept=4)
+    middle = cache.render(field, index)
+    torch.testing.assert_close(cache.render(field, index, within_pixels=torch.zeros(40, 2)), middle)
+    corner = cache.render(field, index, within_pixels=torch.full((40, 2), 0.5))
+    assert 1e-5 < float((corner - middle).detach().abs().max()) < 0.2
+    assert 0.5 < float((cache.pixel_sides * pool.cameras.intrinsics[0, 0]).mean()) / 2.0 < 1.5
 
 
 def test_latent_fit_reaches_appearance_and_latents_but_not_the_geometry() -> None:

@@ -17,6 +17,7 @@ from illuminerf.workflow.processes import ALONE, Team
 from illuminerf.workflow.progress import track
 
 _CHUNK = 4096
+_LEAST_FACING = 0.3  # cosine to the viewer below which a pixel's stretch on the surface grows no more
 
 
 @dataclass
@@ -28,26 +29,37 @@ class ShadingCache:
         positions: float32 [rays, kept, 3].
         weights: float32 [rays, kept]; scaled so that they sum to the opacity of the whole ray.
         normals: float32 [rays, kept, 3], those that the radiance fields see.
+        pixel_sides: float32 [rays], how wide the ray's pixel is at its heaviest sample, in world units.
     """
 
     directions: Float[Tensor, "rays 3"]
     positions: Float[Tensor, "rays kept 3"]
     weights: Float[Tensor, "rays kept"]
     normals: Float[Tensor, "rays kept 3"]
+    pixel_sides: Float[Tensor, " rays"]
 
     def render(
         self,
         field: RadianceField,
         index: Int[Tensor, " batch"],
         latents: Float[Tensor, "batch latent"] | None = None,
+        within_pixels: Float[Tensor, "batch 2"] | None = None,
     ) -> Float[Tensor, "batch 3"]:
-        """Colours (premultiplied sRGB) of the chosen rays; differentiable in appearance and latents."""
-        weights = self.weights[index]
+        """Colours (premultiplied sRGB) of the chosen rays; differentiable in appearance and latents.
+
+        Args:
+            within_pixels: where in its pixel each ray passes, from -0.5 to 0.5; None: through the middle. Shading
+                points are moved to there along the surface's tangent plane.
+        """
+        weights, directions = self.weights[index], self.directions[index]
         ray, kept = (weights > field.config.min_weight).nonzero().unbind(-1)
         source = index[ray]
-        normals = self.normals[source, kept]
-        points = ShadingPoints(ray, self.positions[source, kept], weights[ray, kept], normals)
-        return field.shade(points, normals, self.directions[index], latents)
+        positions, normals = self.positions[source, kept], self.normals[source, kept]
+        if within_pixels is not None:
+            steps = within_pixels * self.pixel_sides[index, None]
+            positions = positions + steps_on_surface(steps[ray], directions[ray], normals)
+        points = ShadingPoints(ray, positions, weights[ray, kept], normals)
+        return field.shade(points, normals, directions, latents)
 
 
 @torch.no_grad()
@@ -62,7 +74,8 @@ def cache_shading(field: RadianceField, pool: RayPool, num_kept: int) -> Shading
     num_kept = min(num_kept, field.config.num_samples)
     rays, device = pool.num_foreground, pool.view.device
     # filled in place: parts to be joined would take the same room again
-    shapes = ((3,), (num_kept, 3), (num_kept,), (num_kept, 3))
+    shapes = ((3,), (num_kept, 3), (num_kept,), (num_kept, 3), ())
+    focal_lengths = torch.from_numpy(pool.cameras.intrinsics[:, 0]).float().to(device)
     cache = ShadingCache(*(torch.empty(rays, *shape, device=device) for shape in shapes))
     for index in track(
         torch.arange(rays, device=device).split(_CHUNK), "find shading points", math.ceil(rays / _CHUNK)
@@ -82,7 +95,25 @@ def cache_shading(field: RadianceField, pool: RayPool, num_kept: int) -> Shading
         _, normals = field.shading_normals(flat)
         cache.directions[index], cache.positions[index] = directions, positions
         cache.weights[index], cache.normals[index] = weights, normals.view_as(positions)
+        distances = (positions[:, 0] - origins).norm(dim=-1)
+        cache.pixel_sides[index] = distances / focal_lengths[pool.view[index].long()]
     return cache
+
+
+def steps_on_surface(
+    steps: Float[Tensor, "points 2"], directions: Float[Tensor, "points 3"], normals: Float[Tensor, "points 3"]
+) -> Float[Tensor, "points 3"]:
+    """How far the point moves on its tangent plane when its ray takes a step across itself, in world units.
+
+    Args:
+        steps: in two directions that a ray is normal to, whichever they are.
+    """
+    steep = directions[:, 2:].abs() > 0.9
+    other = torch.where(steep, directions.new_tensor([1.0, 0, 0]), directions.new_tensor([0, 0, 1.0]))
+    right = torch.nn.functional.normalize(torch.linalg.cross(directions, other), dim=-1)
+    across = steps[:, :1] * right + steps[:, 1:] * torch.linalg.cross(right, directions)
+    facing = (directions * normals).sum(-1, keepdim=True).clamp_max(-_LEAST_FACING)
+    return across - directions * ((across * normals).sum(-1, keepdim=True) / facing)
 
 
 def latent_loss(
@@ -92,6 +123,7 @@ def latent_loss(
     target_srgb: Float[Tensor, "batch 3"],
     latents: Float[Tensor, "batch latent"] | None,
     latent_penalty: float,
+    within_pixels: Float[Tensor, "batch 2"] | None = None,
     team: Team = ALONE,
     batch: int = 0,
 ) -> tuple[Tensor, dict[str, float]]:
@@ -100,9 +132,10 @@ def latent_loss(
     Deviation: a small penalty on the squared latents keeps the zero code, which is rendered at test, in their midst.
 
     Args:
+        within_pixels: see `ShadingCache.render`.
         batch: rays of all processes together.
     """
-    colour = losses.colour_loss(cache.render(field, index, latents), target_srgb)
+    colour = losses.colour_loss(cache.render(field, index, latents, within_pixels), target_srgb)
     total = colour
     if latents is not None:
         total = total + latent_penalty * latents.square().sum(-1).mean()

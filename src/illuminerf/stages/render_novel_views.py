@@ -19,6 +19,7 @@ from illuminerf.workflow.device import resolve_device
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import track
 
+_LEAST_SAMPLES = 32  # with the 16 that a fit makes do with, outlines have light specks
 _TRAINED_CHUNK = 8192  # samples as in training take far more memory per ray
 
 
@@ -49,7 +50,7 @@ class Config:
     latent_index: int | None = None
     """Which training image's latent code to render; None is the zero code, as in the paper's results."""
     num_samples: int | None = None
-    """Samples per ray, placed as in training; None takes those of training."""
+    """Samples per ray, placed as in training; None takes those of training, and 32 where they were fewer."""
     marches: bool = False
     """Follow each ray through the surface in steps as fine as beta instead. Closer to the integral that the field
     stands for; it then also shows what no photograph constrains, such as the underside of what stands on a table."""
@@ -110,7 +111,7 @@ def _renderer(stored: StoredField, config: Config) -> Callable[[Cameras, int, to
         shell = surface_shell(stored.field.surface, stored.cells)
         return partial(render_image, stored.field, shell, chunk=chunk)
     trained = stored.field.config
-    num_samples = config.num_samples or trained.num_samples
+    num_samples = config.num_samples or max(trained.num_samples, _LEAST_SAMPLES)
     # what is left out must not grow with the number of samples
     least = trained.min_weight * min(trained.num_samples / num_samples, 1)
     stored.field.config = replace(trained, num_samples=num_samples, min_weight=least)
