@@ -44,6 +44,7 @@ from illuminerf.stages import (
     render_novel_views,
     render_radiance_cues,
     render_training_pairs,
+    rotate_light,
     train_relighting_model,
     use_mesh,
 )
@@ -54,6 +55,7 @@ from illuminerf.workflow.task_pool import Execution
 PositionalPath = Annotated[Path, tyro.conf.Positional]
 _DEFAULT_PREVIEW = preview_training_pairs.Config()
 _ALL_CORES = Execution()
+_ONE_TURN = rotate_light.Config()
 
 
 def relight_command(
@@ -128,6 +130,25 @@ def render_command(
     """
     film = films.render(RunFolder(run), out, light, cameras, size, views, gif, device)
     say(f"done: {film.video}, {len(film.frames)} views in {film.frames[0].parent}")
+
+
+def rotate_light_command(
+    run: PositionalPath,
+    out: Path,
+    light: str | None = None,
+    model: str = "embedded",
+    config: Annotated[rotate_light.Config, tyro.conf.arg(name="")] = _ONE_TURN,
+) -> None:
+    """Film one photograph of a finished run while the light turns about it: rotating.mp4 and .gif.
+
+    Args:
+        run: What `illuminerf relight --out` named.
+        out: Folder for images/*.png and the films; run the same command again to go on after an interruption.
+        light: Which of the run's lights (the name of its file); not needed where there is one.
+        model: The relighting model: a folder, embedded or dilightnet.
+        config: Which photograph, and how the light turns.
+    """
+    say(f"done: {films.rotate_light(RunFolder(run), out, light, model, config)}")
 
 
 def demo_command(out: Path = Path("runs/demo"), device: str = "auto", seed: int = 0) -> None:
@@ -267,6 +288,7 @@ def _stage(
 COMMANDS: dict[str, Callable[..., Any]] = {
     "relight": relight_command,
     "render": render_command,
+    "rotate-light": rotate_light_command,
     "demo": demo_command,
     "presets": presets_command,
     "view": view_command,

@@ -151,7 +151,7 @@ def _relight_all(
     if device == torch.device("cuda"):  # under a launcher each process has a GPU of its own
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
     network = pretrained_model(folder, device)
-    exposure = exposure_for(sources.views, sources.cues)
+    exposure = exposure_for(len(sources.views), sources.cues)
     num_views = sum(map(len, ours))
     with step_progress("relight views", num_views, num_views - sum(map(len, todo))) as progress:
         for batch in todo:
@@ -169,7 +169,12 @@ def _relight(
     out: Path,
     exposure: float,
 ) -> None:
-    photographs = [_photograph(sources, view, network.device) for view in batch]
+    photographs = []
+    for view in batch:
+        name = f"{view:03d}.exr"
+        shading = None if sources.illumination is None else sources.illumination / "shading" / name
+        cues = sources.cues / "cues" / name
+        photographs.append(photograph(sources.views, view, cues, shading, sources.gloss, network.device))
     relit = relight_photographs(
         network,
         photographs,
@@ -185,10 +190,10 @@ def _relight(
             write_png(sample_path(out, view, sample), image.permute(1, 2, 0).cpu().numpy())
 
 
-def exposure_for(views: Views, cues: Path) -> float:
+def exposure_for(num_views: int, cues: Path) -> float:
     """The factor that brings the diffuse cue to the level that models are trained at: one for all views, so that they
     agree, from the mean over covered pixels of a few of them. 1 where the light hardly reaches the object."""
-    chosen = np.linspace(0, len(views) - 1, min(len(views), _METERED_VIEWS)).round().astype(int)
+    chosen = np.linspace(0, num_views - 1, min(num_views, _METERED_VIEWS)).round().astype(int)
     total, covered = 0.0, 0.0
     for view in chosen:
         channels = read_exr(Path(cues) / "cues" / f"{view:03d}.exr")
@@ -204,18 +209,31 @@ def gloss_of(illumination: Path | None) -> float:
     return 1.0 if gloss is None else float(gloss)
 
 
-def _photograph(sources: _Sources, view: int, device: torch.device) -> Photograph:
-    alpha = sources.views.alpha[view]
-    cues = _straight(sources.cues / "cues" / f"{view:03d}.exr", CUE_CHANNELS, alpha.shape)
-    cues[3:] *= sources.gloss
-    shading = np.zeros((3, *alpha.shape), np.float32)
-    if sources.illumination is not None:
-        shading = _straight(sources.illumination / "shading" / f"{view:03d}.exr", "RGB", alpha.shape)
-    masked = np.concatenate([sources.views.srgb[view] * alpha[..., None], alpha[..., None]], -1)
+def photograph(
+    views: Views, view: int, cues: Path, shading: Path | None, gloss: float, device: torch.device
+) -> Photograph:
+    """A view of a capture as the model takes it.
+
+    Args:
+        views: the capture's.
+        view: which of them.
+        cues: EXR of its radiance cues under the target light.
+        shading: EXR of its diffuse shading under the photographs' own light; None: unknown.
+        gloss: see `gloss_of`.
+        device: where it goes.
+
+    Raises:
+        UserError: a file lacks a channel or has another size.
+    """
+    alpha = views.alpha[view]
+    target = _straight(cues, CUE_CHANNELS, alpha.shape)
+    target[3:] *= gloss
+    own = np.zeros((3, *alpha.shape), np.float32) if shading is None else _straight(shading, "RGB", alpha.shape)
+    masked = np.concatenate([views.srgb[view] * alpha[..., None], alpha[..., None]], -1)
     return Photograph(
         torch.from_numpy(np.ascontiguousarray(masked.transpose(2, 0, 1))).float().to(device),
-        torch.from_numpy(cues).float().to(device),
-        torch.from_numpy(shading).float().to(device),
+        torch.from_numpy(target).float().to(device),
+        torch.from_numpy(own).float().to(device),
     )
 
 
