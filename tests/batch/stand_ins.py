@@ -35,16 +35,30 @@ class Config:
     samples: int = 1
 
 
-def job(name: str, folder: Path, out: str, lights: tuple[str, ...] = ("studio", "evening"), samples: int = 1) -> Job:
+def job(
+    name: str,
+    folder: Path,
+    out: str,
+    lights: tuple[str, ...] = ("studio", "evening"),
+    samples: int = 1,
+    device: str = "cpu",
+) -> Job:
     """A job of stand-ins; what lies in its capture folder steers it."""
     (folder / name).mkdir(parents=True, exist_ok=True)
-    return Job(name, str(folder / name), lights, f"{out}/{name}", customised("demo", samples=samples, device="cpu"))
+    return Job(name, str(folder / name), lights, f"{out}/{name}", customised("demo", samples=samples, device=device))
 
 
 def stages(_: Job) -> dict[str, Stage]:
     """The table."""
     return {
-        name: Stage(needs, _runner(name), name, lambda preset: Config(preset.relighting.num_samples), name == "cues")
+        name: Stage(
+            needs,
+            _runner(name),
+            name,
+            lambda preset: Config(preset.relighting.num_samples),
+            is_sharded=name == "cues",
+            uses_gpu=name != "capture",
+        )
         for name, needs in NEEDS.items()
     }
 

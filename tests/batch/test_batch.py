@@ -139,33 +139,50 @@ def test_two_batches_do_not_share_a_place(two: list[Job], tmp_path: Path) -> Non
         run(two, tmp_path / "out")
 
 
-class Graveyard:
-    """A pool whose workers die at every geometry."""
+class MadeUpPool:
+    """A pool that does tasks when they are asked for, the last one first; workers die at some stages."""
 
-    capacity, num_workers, num_gpus = 1, 1, 0
-
-    def __init__(self) -> None:
+    def __init__(self, num_workers: int = 1, num_gpus: int = 0, dies_at: str = "") -> None:
+        self.capacity = self.num_workers = num_workers
+        self.num_gpus, self.dies_at = num_gpus, dies_at
         self.tasks: list[Any] = []
+        self.most_gpus = self.most_tasks = 0
 
     def submit(self, function: Any, argument: Any, *, gpus: int = 0) -> None:
-        self.tasks.append((function, argument))
+        self.tasks.append((function, argument, gpus))
+        self.most_tasks = max(self.most_tasks, len(self.tasks))
+        self.most_gpus = max(self.most_gpus, sum(gpus for *_, gpus in self.tasks))
 
     def is_one_done(self, seconds: float) -> bool:
         return True
 
     def next_done(self) -> tuple[Any, Any]:
-        function, task = self.tasks.pop(0)
-        return task, Crash("the worker died") if task.step.stage == "geometry" else function(task)
+        function, task, _ = self.tasks.pop()
+        return task, Crash("the worker died") if task.step.stage == self.dies_at else function(task)
 
     def num_running(self) -> int:
         return len(self.tasks)
 
 
+def made_up(monkeypatch: pytest.MonkeyPatch, pool: MadeUpPool) -> MadeUpPool:
+    monkeypatch.setattr(command, "open_pool", lambda _: contextlib.nullcontext(pool))
+    return pool
+
+
 def test_workers_that_die_are_told(two: list[Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "open_pool", lambda _: contextlib.nullcontext(Graveyard()))
+    made_up(monkeypatch, MadeUpPool(dies_at="geometry"))
     assert run(two, tmp_path / "out") == {"mug": "failed", "shoe": "failed"}
     cell = cells(tmp_path / "out")["mug", "", "geometry"]
     assert cell["error"] == "the worker died" and cell["attempts"] == 2
+
+
+@pytest.mark.parametrize(("device", "most_gpus"), [("auto", 2), ("cpu", 0)])
+def test_a_gpu_is_one_steps_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str, most_gpus: int) -> None:
+    pool = made_up(monkeypatch, MadeUpPool(num_workers=4, num_gpus=2))
+    names = ("a", "b", "c", "d")
+    jobs = [stand_ins.job(name, tmp_path / "photos", str(tmp_path / "out"), device=device) for name in names]
+    assert set(run(jobs, tmp_path / "out").values()) == {"done"}
+    assert (pool.most_gpus, pool.most_tasks) == (most_gpus, 4)
 
 
 @pytest.mark.slow
