@@ -65,6 +65,8 @@ class FinishedSteps:
             and light.is_file()
         ):
             inputs["light"] = fingerprint(light)
+        if step.stage == "geometry" and Path(job.mesh).is_file():
+            inputs["mesh"] = fingerprint(Path(job.mesh))
         refuse_other_key(where, upgraded(old_key, where), key, old_inputs or {}, inputs)
 
     def _fingerprint(self, storage: Storage, step: Step, need: str) -> str:
