@@ -2,6 +2,7 @@
 
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -19,6 +20,7 @@ def s3_bucket(name: str) -> Iterator[str]:
     host, port = running.get_host_and_port()
     import s3fs
 
+    name = f"{name}-{uuid.uuid4().hex[:8]}"  # buckets outlive their server within a process
     with pytest.MonkeyPatch.context() as patch:
         for variable, value in (
             ("AWS_ENDPOINT_URL", f"http://{host}:{port}"),
@@ -74,8 +76,10 @@ class TwoNodes:
 @contextmanager
 def two_nodes() -> Iterator[TwoNodes]:
     """A cluster that is gone afterwards."""
-    nodes = TwoNodes()
-    try:
-        yield nodes
-    finally:
-        nodes.stop()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_worker_niceness", "0")  # else workers starve on a machine that is busy with other tests
+        nodes = TwoNodes()
+        try:
+            yield nodes
+        finally:
+            nodes.stop()
