@@ -1,12 +1,14 @@
 # make demo   install, then relight the bundled capture from photographs to turntable (runs/demo/report.html)
 # make test   install, then run every test
+# make test-min, make test-newest   the same in environments of their own, with the oldest and the newest dependencies
+# make wheel  build dist/*.whl
 # make lint   ruff, types, floors
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test lint format install clean
+.PHONY: demo test test-min test-newest wheel lint format install clean
 
 install: $(INSTALLED)
 
@@ -22,6 +24,14 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
+test-min test-newest: test-%:
+	test -x .venv-$*/bin/python || $(PYTHON) -m venv .venv-$*
+	.venv-$*/bin/python -m pip install --quiet --upgrade $(if $(filter min,$*),--constraint constraints-min.txt) --editable '.[dev]'
+	.venv-$*/bin/python -m pytest -n 2 --dist loadfile $(TESTS)
+
+wheel: $(INSTALLED)
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -33,4 +43,4 @@ format: $(INSTALLED)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) runs build dist
+	rm -rf $(VENV) .venv-min .venv-newest runs build dist

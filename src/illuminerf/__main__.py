@@ -1,6 +1,6 @@
 """`python -m illuminerf`, and so `torchrun -m illuminerf`."""
 
-from illuminerf.cli import main
+from illuminerf.entry import main
 
 if __name__ == "__main__":
     main()

@@ -23,6 +23,7 @@ from illuminerf import (
     pipeline,
     stanford_orb,
 )
+from illuminerf.batch.command import batch_command
 from illuminerf.data.objaverse_download import download_objaverse
 from illuminerf.data.object_collection import read_ids
 from illuminerf.presets import PRESETS, Preset, customised
@@ -290,6 +291,7 @@ COMMANDS: dict[str, Callable[..., Any]] = {
     "render": render_command,
     "rotate-light": rotate_light_command,
     "demo": demo_command,
+    "batch": batch_command,
     "presets": presets_command,
     "view": view_command,
     "capture": _stage(

@@ -82,7 +82,6 @@ def relight(
         TriangleMesh.load(mesh)  # find a bad one before anything is written
     shared = estimate_object(source, preset, out, mesh)
     capture, geometry, illumination = shared["capture"], shared["geometry"], shared.get("illumination")
-    _copy(geometry / "mesh.glb", out / "mesh.glb")
     lights: dict[str, dict[str, Path]] = {}
     scores: dict[str, Any] = {}
     for job in jobs:
@@ -104,12 +103,21 @@ def relight(
                 made["test_views"], job.truth, preset.evaluation, folder / "scores"
             )
             scores[job.name] = read_metrics(made["scores"])
-    first = lights[jobs[0].name]
+    present(out, shared, lights, scores)
+    return scores
+
+
+def present(
+    out: Path, shared: dict[str, Path], lights: dict[str, dict[str, Path]], scores: dict[str, Any] | None = None
+) -> None:
+    """Put what a person looks at first where it is found: the report, and copies of meshes and of the first light's
+    film."""
+    first = next(iter(lights.values()))
+    _copy(shared["geometry"] / "mesh.glb", out / "mesh.glb")
     _copy(first["video"], out / "turntable.mp4")
     if "relit_mesh" in first:
         _copy(first["relit_mesh"] / "relit.glb", out / "relit.glb")
     write_report(out / "report.html", out, shared, lights, scores)
-    return scores
 
 
 def estimate_object(source: Path, preset: Preset, out: Path, mesh: Path | None = None) -> dict[str, Path]:
@@ -150,7 +158,12 @@ def relight_under(
     relit = relight_views.run(capture, cues, preset.relighting_model, illumination, preset.relighting, out / "relit")
     latent_nerf = fit_latent_nerf.run(geometry, capture, relit, preset.latent_nerf, out / "latent_nerf")
     turntable = render_novel_views.run(latent_nerf, None, preset.turntable, out / "turntable")
-    video = out / "turntable.mp4"
+    video = turntable_video(turntable, out / "turntable.mp4")
+    return {"cues": cues, "relit": relit, "latent_nerf": latent_nerf, "turntable": turntable, "video": video}
+
+
+def turntable_video(turntable: Path, video: Path) -> Path:
+    """One turn in a few seconds, on white, from the frames of a turntable; an existing film is kept."""
     if not video.exists():
         frames = sorted((turntable / "images").glob("*.png"))
         write_mp4(
@@ -158,7 +171,7 @@ def relight_under(
             (on_white(read_png(frame)) for frame in frames),
             frames_per_second=max(1, round(len(frames) / _SECONDS_PER_TURN)),
         )
-    return {"cues": cues, "relit": relit, "latent_nerf": latent_nerf, "turntable": turntable, "video": video}
+    return video
 
 
 def seconds_by_stage(run: Path) -> dict[str, float]:

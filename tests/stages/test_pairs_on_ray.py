@@ -1,7 +1,5 @@
 """Training pairs on a real Ray cluster of two nodes, one of which is killed in the middle."""
 
-import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,37 +9,21 @@ from illuminerf.stages import render_training_pairs
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.task_pool import Execution
 from tests.stages.test_render_training_pairs import CONFIG, VIEWS, shards, write_assets
+from tests.workflow.elsewhere import two_nodes
 
 pytestmark = pytest.mark.slow
 CONFIG_OF_MANY = replace(CONFIG, views=replace(VIEWS, num_views=6), objects_per_shard=2)
 
 
 def test_a_killed_node_loses_nothing(tmp_path: Path) -> None:
-    pytest.importorskip("ray", reason="Ray is an extra: pip install 'illuminerf[cluster]'")
-    from ray.cluster_utils import Cluster
-
     models, lights = write_assets(tmp_path)
-    render_training_pairs.run(models, lights, CONFIG_OF_MANY, tmp_path / "alone")
     out = tmp_path / "cluster"
-    node = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
-    cluster = Cluster(initialize_head=True, head_node_args=node | {"include_dashboard": False})
-    lost = cluster.add_node(**node)
-    killed_after: list[int] = []
-
-    def kill_when_busy() -> None:
-        while not (staged := list(out.glob("staging/*/*.item"))):
-            time.sleep(0.02)
-        killed_after.append(len(staged))
-        cluster.remove_node(lost, allow_graceful=False)
-
-    killer = threading.Thread(target=kill_when_busy)
-    killer.start()
-    try:
-        render_training_pairs.run(models, lights, CONFIG_OF_MANY, out, Execution(ray_address=cluster.address))
-        killer.join()
-    finally:
-        cluster.shutdown()
-    assert 0 < killed_after[0] < 18, "the node was killed in the middle"
+    with two_nodes() as nodes:
+        render_training_pairs.run(models, lights, CONFIG_OF_MANY, tmp_path / "alone")
+        killed_after = nodes.kill_one_when(lambda: list(out.glob("staging/*/*.item")))
+        render_training_pairs.run(models, lights, CONFIG_OF_MANY, out, Execution(ray_address=nodes.address))
+        nodes.wait()
+    assert 0 < len(killed_after[0]) < 18, "the node was killed in the middle"
     assert shards(out) == shards(tmp_path / "alone") and len(shards(out)) == 4
 
 

@@ -1,5 +1,6 @@
 """The stage writes every view once, goes on where it stopped, and makes the same bytes either way."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from illuminerf.cues.renderer import CUE_CHANNELS, CueSampling
 from illuminerf.scene.cameras import turntable_cameras
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import read_exr, write_png
-from illuminerf.scene.meshes import sphere_mesh
+from illuminerf.scene.meshes import TriangleMesh, sphere_mesh
 from illuminerf.stages import render_radiance_cues
 from illuminerf.workflow.artefact import fingerprint
 from illuminerf.workflow.atomic import read_json, write_json
@@ -58,6 +59,26 @@ def test_resumed_equals_uninterrupted(inputs: tuple[Path, Path, Path], tmp_path:
     render_radiance_cues.run(*inputs, CONFIG, broken)
     assert kept.stat().st_mtime_ns == written
     assert fingerprint(broken) == fingerprint(whole)
+
+
+def test_shards_share_the_views_and_make_the_same_bytes(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    whole = render_radiance_cues.run(*inputs, CONFIG, tmp_path / "whole")
+    out = tmp_path / "shared"
+    for shard, num_views in (("1/2", 1), ("0/2", 3)):
+        assert not (out / "DONE").exists()
+        render_radiance_cues.run(*inputs, replace(CONFIG, shard=shard), out)
+        assert len(list((out / "cues").glob("*.exr"))) == num_views
+    assert (out / "DONE").read_bytes() == (whole / "DONE").read_bytes()
+    with pytest.raises(UserError, match="0/4"):
+        render_radiance_cues.Config(shard="4/4")
+
+
+def test_a_mesh_that_no_view_sees_is_told(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    mesh = sphere_mesh(2)
+    TriangleMesh(mesh.vertices + np.float32(50), mesh.faces, mesh.vertex_normals).save_glb(inputs[0] / "mesh.glb")
+    with pytest.raises(UserError, match="no view sees the mesh"):
+        render_radiance_cues.run(*inputs, CONFIG, tmp_path / "cues")
+    assert not (tmp_path / "cues" / "DONE").exists()
 
 
 def test_turned_lights_are_other_cues(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:

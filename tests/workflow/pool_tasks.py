@@ -5,7 +5,7 @@ import signal
 import time
 from pathlib import Path
 
-from illuminerf.workflow.task_pool import alive
+from illuminerf.workflow.heartbeat import alive
 
 
 def square(value: int) -> int:

@@ -15,9 +15,9 @@ from illuminerf.cues.object_views import ObjectFile, ViewSettings, item_key, ren
 from illuminerf.scene.relighting_pairs import PREFIX
 from illuminerf.workflow.config import from_json, to_json
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.heartbeat import alive
 from illuminerf.workflow.shards import LeftOut, ShardIndex, is_intact, read_index, sample_tar, write_shard
 from illuminerf.workflow.storage import Storage
-from illuminerf.workflow.task_pool import alive
 
 _DIGEST_BYTES = 32
 

@@ -24,11 +24,12 @@ td:first-child, th:first-child { text-align: left } th { border-bottom: 1px soli
 """
 
 
-def web_page(title: str, body: str, style: str = STYLE, script: str = "") -> bytes:
-    """The whole file; `title` is plain text, `body` HTML."""
+def web_page(title: str, body: str, style: str = STYLE, script: str = "", refresh_seconds: int = 0) -> bytes:
+    """The whole file; `title` is plain text, `body` HTML. A browser loads it anew after `refresh_seconds`, unless 0."""
+    refresh = f"<meta http-equiv=refresh content={refresh_seconds}>" if refresh_seconds else ""
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>"
-        f"<title>{html.escape(title)} - Open IllumiNeRF</title><style>{style}</style>"
+        f"{refresh}<title>{html.escape(title)} - Open IllumiNeRF</title><style>{style}</style>"
         f"<body>{body}{f'<script>{script}</script>' if script else ''}</body></html>\n"
     ).encode()
 

@@ -2,20 +2,24 @@
 
 cues/<000>.exr        12 half channels `CUE_CHANNELS`, linear and premultiplied, and `A`, the mesh's coverage
 light.exr, light.json the light as it was used, and how it was turned and exposed
+
+Several processes or machines can share the views on one folder: `--shard 0/4`, `--shard 1/4`, ..., or one torchrun.
+Whoever finds every view in place seals the artefact.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from illuminerf.cues.renderer import CUE_CHANNELS, CueSampling, render_cues
 from illuminerf.data.capture import load_cameras
 from illuminerf.scene.environment import EnvironmentMap
-from illuminerf.scene.images import write_exr
+from illuminerf.scene.images import read_exr, write_exr
 from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import step_progress
+from illuminerf.workflow.processes import shard_of
+from illuminerf.workflow.progress import say, step_progress
 
 STAGE = "render_radiance_cues"
 _MAX_STOPS = 30.0
@@ -33,10 +37,13 @@ class Config:
     """The light's radiance times 2^stops."""
     max_light_height: int = 512
     """Rows; larger lights are averaged down, so that small lamps keep their energy."""
+    shard: str = ""
+    """Share of the views that this process renders, i/n from 0/n; "": all, or what torchrun says. Changes no result."""
     seed: int = 0
     """Each view's seed is derived from it."""
 
     def __post_init__(self) -> None:
+        shard_of(self.shard)
         if not abs(self.exposure_stops) <= _MAX_STOPS:
             raise UserError("exposure_stops is out of range", got=str(self.exposure_stops), wanted="-30 to 30")
         if not abs(self.light_rotation_radians) < float("inf"):
@@ -58,7 +65,9 @@ def run(geometry: Path, capture: Path, light: Path, config: Config, out: Path) -
     Raises:
         UserError: an input is missing or unusable, or `out` was made with other settings.
     """
-    with open_artefact(out, STAGE, config, {"geometry": geometry, "capture": capture, "light": light}) as artefact:
+    shard, num_shards = shard_of(config.shard)
+    inputs: dict[str, Path | str] = {"geometry": geometry, "capture": capture, "light": light}
+    with open_artefact(out, STAGE, replace(config, shard=""), inputs, is_shared=num_shards > 1) as artefact:
         if artefact.is_done:
             return out
         placed = placed_light(light, config)
@@ -73,15 +82,18 @@ def run(geometry: Path, capture: Path, light: Path, config: Config, out: Path) -
                 "exposure_stops": config.exposure_stops,
             },
         )
-        missing = [view for view in range(len(cameras)) if not cue_path(out, view).exists()]
-        coverage = []
-        with step_progress("radiance cues", len(cameras), len(cameras) - len(missing)) as progress:
-            rendered = render_cues(mesh, cameras, placed, config.sampling, config.seed, missing)
+        views = range(len(cameras))
+        ours = views[shard::num_shards]
+        missing = [view for view in ours if not cue_path(out, view).exists()]
+        with step_progress("radiance cues", len(ours), len(ours) - len(missing)) as progress:
+            rendered = render_cues(mesh, cameras, placed, config.sampling, config.seed, missing) if missing else ()
             for view, image in zip(missing, rendered, strict=True):
                 write_exr(cue_path(out, view), dict(zip((*CUE_CHANNELS, "A"), image, strict=True)))
-                coverage.append(float(image[-1].mean()))
                 progress.advance()
-        if coverage and max(coverage) == 0:
+        if not all(cue_path(out, view).exists() for view in views):
+            say(f"share {shard}/{num_shards} is done; others are not yet")
+            return out
+        if not any(read_exr(cue_path(out, view))["A"].any() for view in views):
             raise UserError(
                 "no view sees the mesh", fix="check that geometry and capture belong together, and delete the folder"
             )

@@ -5,7 +5,8 @@ A folder holds the stage's typed files and
     inputs.json      the fingerprints of what it was made from
     provenance.json  versions, device, seconds, peak memory
     DONE             the artefact's own fingerprint; written last, by an atomic rename
-Same key and DONE: load. Same key, unfinished: resume. Another key: refuse and say which field differs.
+Same key and DONE: load. Same key, unfinished: resume. Another key: refuse and say which field differs. Keys of earlier
+schemas are read as today's (`migrations`).
 """
 
 import hashlib
@@ -25,10 +26,14 @@ from typing import Any
 from illuminerf.workflow.atomic import read_json, remove_partial_files, write_bytes, write_json
 from illuminerf.workflow.config import first_difference, to_json
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.migrations import SCHEMA, upgraded
 
-SCHEMA = 1
 _OWN_FILES = ("config.json", "inputs.json", "provenance.json", "DONE", ".lock")
 _VERSIONED = ("illuminerf", "torch", "numpy", "mitsuba", "diffusers", "numba", "trimesh")
+
+
+class InUse(UserError):
+    """Another process works on the folder; it will not for ever."""
 
 
 @dataclass
@@ -135,9 +140,8 @@ def _check_key(out: Path, key: dict[str, Any], made_from: dict[str, str]) -> boo
                 fix="choose an empty or a new folder with --out",
             )
         return False
-    refuse_other_key(
-        str(out), read_json(config_file), key, read_json(inputs_file) if inputs_file.exists() else made_from, made_from
-    )
+    old_inputs = read_json(inputs_file) if inputs_file.exists() else made_from
+    refuse_other_key(str(out), upgraded(read_json(config_file), str(out)), key, old_inputs, made_from)
     if not (out / "DONE").exists():
         return False
     verify(out)
@@ -227,9 +231,7 @@ def locked(out: Path, is_shared: bool = False) -> Iterator[int]:
         try:
             fcntl.flock(handle, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise UserError(
-                f"another process is working on {out}", fix="wait for it or choose another --out"
-            ) from error
+            raise InUse(f"another process is working on {out}", fix="wait for it or choose another --out") from error
         yield handle
     finally:
         os.close(handle)

@@ -1,5 +1,6 @@
 """Frozen dataclasses to JSON and back, strictly: unknown, missing and mistyped fields are errors."""
 
+import contextlib
 import dataclasses
 import types
 import typing
@@ -41,15 +42,20 @@ def from_json(cls: type[ConfigType], content: dict[str, Any]) -> ConfigType:
         has_default = not (field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING)
         if name not in content and not has_default:
             raise UserError(f"{cls.__name__} lacks the field '{name}'")
-    return cls(**{name: _coerced(f"{cls.__name__}.{name}", hints[name], value) for name, value in content.items()})
+    return cls(**{name: coerced(f"{cls.__name__}.{name}", hints[name], value) for name, value in content.items()})
 
 
-def _coerced(name: str, hint: Any, value: Any) -> Any:
+def coerced(name: str, hint: Any, value: Any) -> Any:
+    """A JSON value as the type `hint`; `name` is what messages call it.
+
+    Raises:
+        UserError: it has another type.
+    """
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
-        return _coerced(name, next(argument for argument in arguments if argument is not type(None)), value)
+        return _coerced_to_one(name, [argument for argument in arguments if argument is not type(None)], value)
     if dataclasses.is_dataclass(hint):
         return from_json(hint, value)  # type: ignore[arg-type]
     if origin is tuple:
@@ -59,11 +65,11 @@ def _coerced(name: str, hint: Any, value: Any) -> Any:
         items = [arguments[0]] * len(value) if variadic else list(arguments)
         if len(items) != len(value):
             raise UserError(f"{name} has {len(value)} entries", wanted=str(len(items)))
-        return tuple(_coerced(name, item, entry) for item, entry in zip(items, value, strict=True))
+        return tuple(coerced(name, item, entry) for item, entry in zip(items, value, strict=True))
     if origin is dict:
         if not isinstance(value, dict):
             raise UserError(f"{name} must be an object", got=type(value).__name__)
-        return {key: _coerced(f"{name}.{key}", arguments[1], entry) for key, entry in value.items()}
+        return {key: coerced(f"{name}.{key}", arguments[1], entry) for key, entry in value.items()}
     if origin is typing.Literal:
         if value not in arguments:
             raise UserError(f"{name} is not a known choice", got=repr(value), wanted=", ".join(map(str, arguments)))
@@ -75,6 +81,33 @@ def _coerced(name: str, hint: Any, value: Any) -> Any:
     if hint in (int, float, str, bool) and type(value) is not hint:
         raise UserError(f"{name} has the wrong type", got=type(value).__name__, wanted=hint.__name__)
     return value
+
+
+def _coerced_to_one(name: str, hints: list[Any], value: Any) -> Any:
+    """The value as the first of several types that takes it; the last one's complaint where none does."""
+    for hint in hints[:-1]:
+        with contextlib.suppress(UserError):
+            return coerced(name, hint, value)
+    return coerced(name, hints[-1], value)
+
+
+def changed(config: ConfigType, name: str, value: Any) -> ConfigType:
+    """A copy of a (nested) frozen dataclass with one field changed, by its dotted name, to a JSON value.
+
+    Raises:
+        UserError: there is no such field, or the value has the wrong type or is out of range.
+    """
+    first, _, rest = name.partition(".")
+    if first not in (fields := [field.name for field in dataclasses.fields(config)]):  # type: ignore[arg-type]
+        raise UserError(f"{type(config).__name__} has no field '{first}'", wanted=", ".join(fields))
+    if not rest:
+        hint = typing.get_type_hints(type(config))[first]
+        new = coerced(f"{type(config).__name__}.{first}", hint, value)
+    elif dataclasses.is_dataclass(part := getattr(config, first)):
+        new = changed(part, rest, value)
+    else:
+        raise UserError(f"{type(config).__name__}.{first} has no fields", got=name, fix=f"set {first} itself")
+    return dataclasses.replace(config, **{first: new})  # type: ignore[type-var]
 
 
 def first_difference(old: Any, new: Any, name: str = "") -> str | None:

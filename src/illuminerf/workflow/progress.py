@@ -16,6 +16,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from illuminerf.workflow.heartbeat import alive
+
 Item = TypeVar("Item")
 _LOG_EVERY_SECONDS = 15.0
 console = Console(stderr=True, soft_wrap=True)
@@ -42,6 +44,7 @@ class StepProgress:
 
     def advance(self, steps: int = 1, **numbers: float) -> None:
         """Count `steps` more; `numbers` are shown beside the bar, e.g. psnr=27.1."""
+        alive()
         self.completed += steps
         note = " ".join(f"{name} {value:.4g}" for name, value in numbers.items())
         if self._bar is not None:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
-from illuminerf.workflow.atomic import remove_partial_files, write_bytes
+from illuminerf.workflow.atomic import atomic_path, remove_partial_files, write_bytes
 from illuminerf.workflow.errors import UserError
 
 _CHUNK = 2**22
@@ -86,6 +87,20 @@ class Storage:
         """
         return bytes(self._fs.cat_file(self._path(name)))
 
+    def read_json(self, name: str) -> Any:
+        """A JSON file's content; None where there is no such file.
+
+        Raises:
+            UserError: it is not JSON.
+        """
+        try:
+            return json.loads(self.read(name))
+        except FileNotFoundError:
+            return None
+        except ValueError as error:
+            fix = "restore the file, or delete its folder and run again"
+            raise UserError(f"{self.url}/{name} is not valid JSON", got=str(error), fix=fix) from error
+
     def chunks(self, name: str) -> Iterator[bytes]:
         """A file's content in pieces of a few MB.
 
@@ -117,6 +132,31 @@ class Storage:
         return sorted(
             (name, entry["type"]) for name, entry in named if name and entry["name"].strip("/") != path.strip("/")
         )
+
+    def tree(self, folder: str = "") -> list[str]:
+        """Names of all files below `folder`, at any depth, sorted, without it; none where it does not exist."""
+        self._fs.invalidate_cache()
+        path = self._path(folder).strip("/")
+        found = (name.strip("/") for name in self._fs.find(self._path(folder)))
+        return sorted(name.removeprefix(f"{path}/") for name in found if name != path)
+
+    def upload(self, source: Path, name: str) -> None:
+        """Write a file from one on this machine, whole or not at all, without holding it in memory."""
+        if self.path:
+            with atomic_path(Path(self._path(name))) as temporary:
+                shutil.copyfile(source, temporary)
+            return
+        self._fs.makedirs(self._path(name).rpartition("/")[0], exist_ok=True)
+        self._fs.put_file(str(source), self._path(name))
+
+    def download(self, name: str, target: Path) -> None:
+        """Write a file's content to one on this machine, whole or not at all.
+
+        Raises:
+            FileNotFoundError: there is none.
+        """
+        with atomic_path(target) as temporary:
+            self._fs.get_file(self._path(name), str(temporary))
 
     def check_reachable(self) -> None:
         """Ask the file system once, so that wrong addresses and credentials are found before any work is done.

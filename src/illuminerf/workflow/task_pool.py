@@ -2,10 +2,9 @@
 
 A worker that dies (a crash in native code, a lost machine, the out-of-memory killer) costs the task it was at: the
 task is tried again elsewhere, and reported as `Crash` when it keeps failing. So does one that runs out of memory, or
-goes on for too long without a sign of life (`alive`). Other errors that are raised are not retried.
+goes on for too long without a sign of life (`heartbeat.alive`). Other errors that are raised are not retried.
 """
 
-import faulthandler
 import importlib
 import multiprocessing
 import os
@@ -16,11 +15,12 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol, TextIO, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from pebble import ProcessExpired, ProcessPool
 
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.heartbeat import watched
 
 _CONNECT_SECONDS = 5.0
 _OUT_OF_MEMORY = 137
@@ -66,9 +66,17 @@ class TaskPool(Protocol):
 
     capacity: int
     """How many tasks are worth having under way."""
+    num_workers: int
+    """How many run at once."""
+    num_gpus: int
+    """GPUs that tasks can have for themselves; 0 where the pool hands out none."""
 
-    def submit(self, function: Callable[[Any], Any], argument: Any) -> None:
-        """Start a task."""
+    def submit(self, function: Callable[[Any], Any], argument: Any, *, gpus: int = 0) -> None:
+        """Start a task, with so many GPUs of its own; at most `num_gpus`."""
+        ...
+
+    def is_one_done(self, seconds: float) -> bool:
+        """Wait until `next_done` would return at once, or for so long; tasks in this process only run in the former."""
         ...
 
     def next_done(self) -> tuple[Any, Any]:
@@ -101,13 +109,16 @@ def num_cores() -> int:
 
 
 class _InProcessPool:
-    capacity = 1
+    capacity, num_workers, num_gpus = 1, 1, 0
 
     def __init__(self) -> None:
         self._waiting: deque[tuple[Callable[[Any], Any], Any]] = deque()
 
-    def submit(self, function: Callable[[Any], Any], argument: Any) -> None:
+    def submit(self, function: Callable[[Any], Any], argument: Any, *, gpus: int = 0) -> None:
         self._waiting.append((function, argument))
+
+    def is_one_done(self, seconds: float) -> bool:
+        return bool(self._waiting)
 
     def next_done(self) -> tuple[Any, Any]:
         function, argument = self._waiting.popleft()
@@ -117,29 +128,14 @@ class _InProcessPool:
         return len(self._waiting)
 
 
-_watched: list[tuple[float, TextIO]] = []
-
-
-def alive() -> None:
-    """Called by a task in between: the watchdog of its worker starts anew. Nothing happens outside of a worker."""
-    if _watched:
-        seconds, nowhere = _watched[-1]
-        faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
-
-
 def _guarded(function: Callable[[Any], Any], argument: Any, seconds: float) -> Any:
     """Run a task under a watchdog that ends this worker process when there is no sign of life."""
     os.environ["ILLUMINERF_TASK_SECONDS"] = str(seconds)  # programs that a task starts must end before it is given up
-    with open(os.devnull, "w") as nowhere:
-        _watched.append((seconds, nowhere))
-        alive()
+    with watched(seconds):
         try:
             return function(argument)
         except MemoryError:
             os._exit(_OUT_OF_MEMORY)  # another worker, or this task later, may have more
-        finally:
-            faulthandler.cancel_dump_traceback_later()
-            _watched.pop()
 
 
 def _process_pool(execution: Execution, workers: int) -> Iterator[TaskPool]:
@@ -160,8 +156,10 @@ def _process_pool(execution: Execution, workers: int) -> Iterator[TaskPool]:
 
 
 class _Processes:
+    num_gpus = 0
+
     def __init__(self, execution: Execution, workers: int) -> None:
-        self._execution, self._workers = execution, workers
+        self._execution, self.num_workers = execution, workers
         self.capacity = 2 * workers
         self._num_starts = 0
         self._running: dict[Future[Any], tuple[Callable[[Any], Any], Any, int]] = {}
@@ -170,7 +168,7 @@ class _Processes:
     def _start(self) -> None:
         self._num_starts += 1
         self._pool = ProcessPool(
-            max_workers=self._workers,
+            max_workers=self.num_workers,
             max_tasks=self._execution.tasks_per_worker,
             context=multiprocessing.get_context("spawn"),
         )
@@ -179,9 +177,15 @@ class _Processes:
         self._pool.stop()
         self._pool.join()
 
-    def submit(self, function: Callable[[Any], Any], argument: Any, attempt: int = 1) -> None:
+    def submit(self, function: Callable[[Any], Any], argument: Any, *, gpus: int = 0) -> None:
+        self._submit(function, argument, 1)
+
+    def _submit(self, function: Callable[[Any], Any], argument: Any, attempt: int) -> None:
         future = self._pool.schedule(_guarded, args=(function, argument, self._execution.task_seconds))
         self._running[future] = (function, argument, attempt)
+
+    def is_one_done(self, seconds: float) -> bool:
+        return bool(wait(self._running, seconds, FIRST_COMPLETED).done)
 
     def next_done(self) -> tuple[Any, Any]:
         while True:
@@ -197,7 +201,7 @@ class _Processes:
                 del self._running[future]
                 if attempt >= self._execution.attempts:
                     return argument, Crash(f"the worker died {attempt} times (exit code {error.exitcode})")
-                self.submit(function, argument, attempt + 1)
+                self._submit(function, argument, attempt + 1)
                 continue
             except BaseException:
                 del self._running[future]
@@ -217,7 +221,7 @@ class _Processes:
         waiting, self._running = list(self._running.values()), {}
         self._start()
         for function, argument, attempt in waiting:
-            self.submit(function, argument, attempt)
+            self._submit(function, argument, attempt)
 
     def num_running(self) -> int:
         return len(self._running)
@@ -248,8 +252,10 @@ def _ray_pool(execution: Execution) -> Iterator[TaskPool]:
 class _RayTasks:
     def __init__(self, ray: Any, execution: Execution) -> None:
         self._ray, self._execution = ray, execution
-        cores = int(ray.cluster_resources().get("CPU", 1))
-        self.capacity = 2 * (execution.workers or cores)
+        resources = ray.cluster_resources()
+        self.num_workers = execution.workers or int(resources.get("CPU", 1))
+        self.num_gpus = int(resources.get("GPU", 0))
+        self.capacity = 2 * self.num_workers
         environment = {"env_vars": dict.fromkeys(_THREAD_SETTINGS, "1")}
         # Ray retries a task whose worker or machine is lost; errors that the task raises are not retried
         self._remote = ray.remote(
@@ -261,9 +267,12 @@ class _RayTasks:
         )(_guarded)
         self._running: dict[Any, Any] = {}
 
-    def submit(self, function: Callable[[Any], Any], argument: Any) -> None:
-        reference = self._remote.remote(function, argument, self._execution.task_seconds)
-        self._running[reference] = argument
+    def submit(self, function: Callable[[Any], Any], argument: Any, *, gpus: int = 0) -> None:
+        remote = self._remote.options(num_gpus=gpus) if gpus else self._remote
+        self._running[remote.remote(function, argument, self._execution.task_seconds)] = argument
+
+    def is_one_done(self, seconds: float) -> bool:
+        return bool(self._ray.wait(list(self._running), num_returns=1, timeout=seconds)[0])
 
     def next_done(self) -> tuple[Any, Any]:
         (reference, *_), _ = self._ray.wait(list(self._running), num_returns=1)

@@ -1,0 +1,42 @@
+"""Names of all commands, with a line each, for help that needs no imports. tests/test_entry.py holds them to `cli`."""
+
+SUMMARIES = {
+    "relight": "every stage of the method, from photographs to turntable, mesh and report",
+    "render": "a finished run along a camera path or a turntable: PNG, EXR, MP4, GIF",
+    "demo": "relight the capture that ships with the package and score the result",
+    "batch": "many captures under many lights, here or on a cluster",
+    "presets": "what each preset is for and what it costs",
+    "view": "look at a finished run in the browser",
+    "capture": "photographs without poses, or a video, to a capture",
+    "import-capture": "a folder of posed photographs to a capture",
+    "estimate-geometry": "fit the surface field to a capture",
+    "use-mesh": "take a mesh in the capture's world for its geometry",
+    "estimate-illumination": "the photographs' own light",
+    "render-radiance-cues": "path trace the geometry's cues under a light",
+    "relight-views": "draw relit samples of every photograph",
+    "fit-latent-nerf": "distil all relit samples into one latent NeRF",
+    "render-novel-views": "render a fitted field",
+    "bake-relit-mesh": "paint the mesh with a latent NeRF's colours",
+    "evaluate-relighting": "score rendered views against the truth by the TensoIR rule",
+    "fit-materials": "inverse rendering, to compare with",
+    "render-materials": "path trace fitted materials under a light",
+    "render-training-pairs": "what a relighting model learns from",
+    "render-paper-pairs": "the same with the paper's numbers",
+    "train-rdm": "train a relighting diffusion model",
+    "train-paper-rdm": "the same with the paper's settings",
+    "evaluate-rdm": "score a relighting model on rendered pairs",
+    "render-demo-capture": "the bundled capture, from its formulas",
+}
+GROUPS = {
+    "benchmark": (
+        "tensoir",
+        "stanford-orb",
+        "stanford-orb-illumination",
+        "ablation",
+        "geometry",
+        "report",
+    ),
+    "data": ("preview", "download-objaverse", "example-assets", "tensoir-gallery", "synthetic-orb"),
+    "lights": ("list", "preview", "convert"),
+    "models": ("list", "info", "download", "export"),
+}
