@@ -20,7 +20,7 @@ class MetricsLog:
         self.path = folder / "metrics.jsonl"
         self.board = _board(folder / "tensorboard", first_step) if tensorboard else None
         kept = [line for line in _records(self.path) if line["step"] <= first_step]
-        write_bytes(self.path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in kept).encode())
+        write_bytes(self.path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in kept).encode(), True)
 
     def write(self, kind: str, step: int, values: dict[str, float], **only_for_board: float) -> None:
         """Record numbers after `step` finished steps; `only_for_board` is for what differs from run to run."""
@@ -57,9 +57,11 @@ def _board(folder: Path, first_step: int) -> Any:
 def _records(path: Path) -> list[dict[str, Any]]:
     """Whole lines only: the last one may have been cut off."""
     records = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
         try:
-            records.append(json.loads(line))
+            record = json.loads(line)
         except ValueError:
             continue
+        if isinstance(record, dict) and isinstance(record.get("step"), int):
+            records.append(record)
     return records
