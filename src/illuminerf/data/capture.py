@@ -133,7 +133,7 @@ def load_capture(folder: Path) -> Capture:
             np.array(content["offset"], np.float64),
             "masked" if content["background"] == "masked" else "opaque",
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise UserError(
             f"{folder / 'capture.json'} is not that of a capture",
             got=f"{type(error).__name__}: {error}",
