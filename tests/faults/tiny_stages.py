@@ -37,7 +37,7 @@ _ILLUMINATION = estimate_illumination.Config(
 )
 _TURNTABLE = render_novel_views.TurntableConfig(num_views=2, height=10, width=10)
 _VIEWS = ViewSettings(
-    num_views=2, num_lights=2, size=12, samples_per_pixel=2, cue_sampling=CueSampling(2), light_height=8
+    num_views=2, num_lights=2, size=16, samples_per_pixel=2, cue_sampling=CueSampling(2), light_height=8
 )
 _TRAINING = train_relighting_model.Config(
     model=TINY,

@@ -128,7 +128,8 @@ class World:
     def _differs(self, stage: Stage, out: Path) -> str:
         """The first file that is not as in the undisturbed run; "" where there is none."""
         found, expected = contents(out), self.expected[stage.name]
-        return next((name for name in sorted({*found, *expected}) if found.get(name) != expected.get(name)), "")
+        names = sorted({*found, *expected}, key=lambda name: (name == "DONE", name))
+        return next((name for name in names if found.get(name) != expected.get(name)), "")
 
     def _damaged(self, stage: Stage, damage: Damage, draw: random.Random, place: Path) -> Verdict:
         """Spoil a finished folder; then read it with every stage that does, and make it again."""

@@ -1,5 +1,6 @@
 """Inputs that are almost right: bytes, JSON and containers of both, changed at random by a seed."""
 
+import copy
 import json
 import random
 import struct
@@ -57,7 +58,7 @@ def mutated_json(text: bytes, draw: random.Random, other: bytes = b"") -> bytes:
         return mutated_bytes(text, draw, other)
     for _ in range(1 + min(int(draw.expovariate(0.8)), 6)):
         parent, key = _place(whole, draw)
-        if isinstance(parent[key], (int, float)) and draw.random() < 0.4:
+        if isinstance(parent[key], (int, float)) and abs(parent[key]) < 1e300 and draw.random() < 0.4:
             parent[key] = parent[key] * draw.choice((-1, 0.5, 2, 1e3, 1e9, 1 + 1e-9)) + draw.choice((0, 1, -1))
         elif isinstance(parent[key], str) and draw.random() < 0.4:
             parent[key] = mutated_bytes(parent[key].encode("utf-8", "replace"), draw).decode("utf-8", "replace")
@@ -70,7 +71,7 @@ def mutated_json(text: bytes, draw: random.Random, other: bytes = b"") -> bytes:
             source, name = _place(whole, draw)
             parent[key] = json.loads(_text(source[name]))
         else:
-            parent[key] = draw.choice(_HOSTILE)
+            parent[key] = copy.deepcopy(draw.choice(_HOSTILE))
     if draw.random() < 0.005:
         return b"[" * 100_000
     return _text(whole[0])

@@ -106,7 +106,9 @@ def _hdrs(_: Path) -> list[bytes]:
 
 
 def _glbs(folder: Path) -> list[bytes]:
-    plain = Gltf().mesh().glb(folder / "seed.glb").read_bytes()
+    simple = Gltf().mesh()
+    simple.json["scenes"] = [{"nodes": [0]}]
+    plain = simple.glb(folder / "seed.glb").read_bytes()
     textured = Gltf()
     look = {"pbrMetallicRoughness": {"baseColorTexture": textured.texture(png((9, 99, 200))), "roughnessFactor": 0.4}}
     colours = np.full((4, 4), 200, np.uint8)
@@ -117,7 +119,9 @@ def _glbs(folder: Path) -> list[bytes]:
 
 
 def _gltfs(folder: Path) -> list[bytes]:
-    return [Gltf().mesh(TEXCOORD_0=UV).gltf(folder / "seed.gltf").read_bytes()]
+    document = Gltf().mesh(TEXCOORD_0=UV)
+    document.json["scenes"] = [{"nodes": [0]}]
+    return [document.gltf(folder / "seed.gltf").read_bytes()]
 
 
 def _objs(folder: Path) -> list[bytes]:
@@ -135,7 +139,7 @@ def _mtls(folder: Path) -> list[bytes]:
     content = (
         b"newmtl red\nKd 0.8 0.1 0.1\nKs 1 1 1\nNs 40\nillum 2\nmap_Kd -s 1 1 1 red.png\nnorm -bm 2 red.png\nPr 0.3\n"
     )
-    return [content, b"newmtl red\nbsdf pbr\nmap_Ks red.png\nd 0.5\n"]
+    return [content, b"newmtl red\nbsdf pbr\nmap_Ks red.png\nd 1\n"]
 
 
 def _plys(folder: Path) -> list[bytes]:

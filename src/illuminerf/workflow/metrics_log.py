@@ -20,13 +20,20 @@ class MetricsLog:
         self.path = folder / "metrics.jsonl"
         self.board = _board(folder / "tensorboard", first_step) if tensorboard else None
         kept = [line for line in _records(self.path) if line["step"] <= first_step]
-        write_bytes(self.path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in kept).encode(), True)
+        lines = [json.dumps(line, sort_keys=True) + "\n" for line in kept]
+        self._last = lines[-1] if lines else ""
+        write_bytes(self.path, "".join(lines).encode(), grows=True)
 
     def write(self, kind: str, step: int, values: dict[str, float], **only_for_board: float) -> None:
-        """Record numbers after `step` finished steps; `only_for_board` is for what differs from run to run."""
-        record = {"kind": kind, "step": step, **values}
-        with open(self.path, "a", encoding="utf-8") as stream:
-            stream.write(json.dumps(record, sort_keys=True) + "\n")
+        """Record numbers after `step` finished steps; `only_for_board` is for what differs from run to run.
+
+        A record like the last one is not repeated: a run that was stopped after its last step measures once more.
+        """
+        line = json.dumps({"kind": kind, "step": step, **values}, sort_keys=True) + "\n"
+        if line != self._last:
+            with open(self.path, "a", encoding="utf-8") as stream:
+                stream.write(line)
+            self._last = line
         if self.board is not None:
             for name, value in (values | only_for_board).items():
                 self.board.add_scalar(f"{kind}/{name}", value, step)
