@@ -3,13 +3,30 @@
 `benchmarks/faults.py` tries hundreds, over all stages.
 """
 
+from unittest import mock
+
 import pytest
 
-from tests.faults.trials import World
+from illuminerf.workflow import artefact
+from tests.faults.trials import TRIAL_KINDS, Trial, World
 
-_NAMES = ("capture", "cues", "views")
+_STAGES = ("capture", "cues")
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> World:
-    return World(tmp_path_factory.mktemp("faults"), _NAMES)
+    return World(tmp_path_factory.mktemp("faults"), _STAGES)
+
+
+@pytest.mark.parametrize("kind", TRIAL_KINDS)
+def test_started_again_it_ends_alike_or_names_the_damage(kind: str, world: World) -> None:
+    for seed, stage in enumerate(_STAGES):
+        verdict = world.attempt(Trial(stage, kind, seed))  # type: ignore[arg-type]
+        assert verdict.verdict in ("same", "named"), verdict.detail
+
+
+def test_without_checksums_a_flipped_bit_goes_unseen(world: World) -> None:
+    """Guard: the harness tells a silent difference from the rest."""
+    trials = [Trial("capture", "flip", seed) for seed in range(8)]
+    with mock.patch.object(artefact, "verify_once", lambda _: None):
+        assert "silent" in {world.attempt(trial).verdict for trial in trials}
