@@ -21,6 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tests.fuzz.readers import READERS
 from tests.fuzz.sandbox import GIGABYTES, SECONDS, Escape, Tally, fuzz
 
+_MEMORY = "/dev/shm"
+
 
 def summary(tallies: dict[str, Tally], escapes: list[Escape], seconds: float) -> dict[str, Any]:
     """Counts by reader; of escapes that look alike only the first."""
@@ -51,7 +53,9 @@ def main() -> None:
     began = time.monotonic()
     tallies: dict[str, Tally] = {}
     escapes: list[Escape] = []
-    with tempfile.TemporaryDirectory(prefix="illuminerf_fuzz_") as folder:
+    with tempfile.TemporaryDirectory(
+        prefix="illuminerf_fuzz_", dir=_MEMORY if Path(_MEMORY).is_dir() else None
+    ) as folder:
         for done, name in enumerate(options.readers):
             left = 60 * options.minutes - (time.monotonic() - began)
             share = left / (len(options.readers) - done)

@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import field, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -47,6 +47,7 @@ from illuminerf.stages import (
     train_relighting_model,
     use_mesh,
 )
+from illuminerf.workflow.atomic import explained_errors
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say
 from illuminerf.workflow.task_pool import Execution
@@ -406,25 +407,31 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     warnings.showwarning = lambda message, *_: say(f"[yellow]warning:[/yellow] {escape(str(message))}", markup=True)
     try:
-        if arguments[:1] and arguments[0] in GROUPS:
-            group = arguments[0]
-            tyro.extras.subcommand_cli_from_dict(GROUPS[group], prog=f"illuminerf {group}", args=arguments[1:])
-        else:
-            chosen = tyro.extras.subcommand_cli_from_dict(
-                COMMANDS,
-                prog="illuminerf",
-                description="Relight photographed objects. Also: "
-                + ", ".join(f"illuminerf {name} --help" for name in GROUPS),
-                args=arguments,
-            )
-            if isinstance(chosen, StageCall):
-                chosen.execute()
+        with explained_errors(Path.cwd()):
+            _execute(arguments)
     except UserError as error:
         say(f"[bold red]error:[/bold red] {escape(str(error))}", markup=True)
         sys.exit(2)
     except KeyboardInterrupt:
         say("stopped; run the same command again to go on")
         sys.exit(130)
+
+
+def _execute(arguments: Sequence[str]) -> None:
+    """Run the subcommand that the arguments name."""
+    if arguments[:1] and arguments[0] in GROUPS:
+        group = arguments[0]
+        tyro.extras.subcommand_cli_from_dict(GROUPS[group], prog=f"illuminerf {group}", args=arguments[1:])
+    else:
+        chosen = tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="illuminerf",
+            description="Relight photographed objects. Also: "
+            + ", ".join(f"illuminerf {name} --help" for name in GROUPS),
+            args=arguments,
+        )
+        if isinstance(chosen, StageCall):
+            chosen.execute()
 
 
 __all__ = ["COMMANDS", "GROUPS", "Preset", "main"]

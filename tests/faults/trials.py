@@ -1,7 +1,8 @@
 """One fault at a time: disturb a stage or what it made, start it again, and say what came of it.
 
 A trial ends well where the second start gives the same bytes as an undisturbed run, or where the damage is named in a
-UserError. All work is done in forks of this process, which has the libraries loaded and no threads.
+UserError. All work is done in forks of this process, which has the libraries loaded and must not have used their
+threads.
 """
 
 import hashlib
@@ -64,8 +65,6 @@ class World:
     """
 
     def __init__(self, folder: Path, names: tuple[str, ...] = tuple(STAGES)) -> None:
-        torch.set_num_threads(1)
-        mitsuba_variant.find_llvm = lambda: None  # no kernels to compile in every fork
         self.folder, self.made, self.operations, self.seconds = folder, folder / "made", {}, {}
         write_inputs(self.made)
         for stage in _needed(names):
@@ -76,6 +75,8 @@ class World:
         self.expected = {stage.name: contents(self.made / stage.name) for stage in _needed(names)}
 
     def _run(self, stage: Stage, out: Path, replaced: dict[str, Path] | None = None) -> object:
+        torch.set_num_threads(1)  # always in a fork, which has no other threads
+        mitsuba_variant.find_llvm = lambda: None  # and would compile kernels each time
         found = {name: self.made / name for name in stage.inputs} | (replaced or {})
         return stage.make(*(found[name] for name in stage.inputs), out)
 

@@ -11,8 +11,9 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from illuminerf.workflow.errors import UserError
 
@@ -44,7 +45,7 @@ def recorded_writes(folder: Path) -> Iterator[None]:
         _recorded.remove(resolved)
 
 
-def _record(path: Path, written: BinaryIO) -> None:
+def _record(path: Path, written: BufferedReader) -> None:
     resolved = path.resolve()
     for folder in {folder for folder in _recorded if resolved.is_relative_to(folder)}:
         name = resolved.relative_to(folder).as_posix()

@@ -139,8 +139,10 @@ def written_digests(out: Path) -> dict[str, set[str]]:
 
 def first_damaged(out: Path) -> Path | None:
     """The first file of an unfinished folder that is none of what was written under its name."""
-    for name in written_digests(out):
+    for name, digests in written_digests(out).items():
         path = out / name
-        if path.is_file() and file_digest(path) not in written_digests(out)[name]:  # the journal grows meanwhile
-            return path
+        if path.is_file() and file_digest(path) not in digests:
+            # another process may have written it since the list was read
+            if file_digest(path) not in written_digests(out)[name]:
+                return path
     return None
