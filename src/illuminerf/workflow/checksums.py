@@ -141,8 +141,8 @@ def first_damaged(out: Path) -> Path | None:
     """The first file of an unfinished folder that is none of what was written under its name."""
     for name, digests in written_digests(out).items():
         path = out / name
-        if path.is_file() and file_digest(path) not in digests:
-            # another process may have written it since the list was read
-            if file_digest(path) not in written_digests(out)[name]:
-                return path
+        is_listed = not path.is_file() or file_digest(path) in digests
+        # another process may have written it since the list was read
+        if not is_listed and file_digest(path) not in written_digests(out)[name]:
+            return path
     return None
