@@ -100,7 +100,9 @@ def verify_once(out: Path) -> None:
 
 
 def _state(out: Path) -> _States:
-    found = ((path.as_posix(), path.stat()) for path in sorted(out.rglob("*")) if path.is_file())
+    # the two that another process may just be removing tell nothing
+    paths = (path for path in sorted(out.rglob("*")) if path.name not in (".lock", JOURNAL) and path.is_file())
+    found = ((path.as_posix(), path.stat()) for path in paths)
     return tuple((name, stat.st_size, stat.st_mtime_ns, stat.st_ino) for name, stat in found)
 
 
