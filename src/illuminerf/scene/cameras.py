@@ -127,7 +127,7 @@ class Cameras:
         }
 
     @staticmethod
-    def from_dict(content: dict[str, Any]) -> "Cameras":
+    def from_dict(content: Any) -> "Cameras":
         """Read what `to_dict` made.
 
         Raises:

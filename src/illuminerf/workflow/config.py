@@ -25,7 +25,7 @@ def to_json(config: Any) -> Any:
     return config
 
 
-def from_json(cls: type[ConfigType], content: dict[str, Any]) -> ConfigType:
+def from_json(cls: type[ConfigType], content: Any) -> ConfigType:
     """Build the dataclass `cls` from what `to_json` made of it.
 
     Raises:
