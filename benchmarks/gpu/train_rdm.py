@@ -24,6 +24,8 @@ from safetensors import safe_open
 from illuminerf.stages import train_relighting_model
 from illuminerf.stages.train_relighting_model import Config, Phase
 from illuminerf.workflow.artefact import read_metrics
+from illuminerf.workflow.atomic import write_bytes
+from illuminerf.workflow.checksums import seal_digest
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from benchmarks.gpu.carried_folder import differences, pack, unpack  # noqa: E402
@@ -88,6 +90,8 @@ def main() -> None:
     if is_brought:
         unpack(options.carried, options.out)
         if (options.out / "DONE").exists():
+            # pictures stayed behind: the folder is sealed for what has come
+            write_bytes(options.out / "DONE", (seal_digest(options.out) + "\n").encode())
             print(json.dumps({"ended": "was done before", "model": str(options.out), "passed": True}))
             return
     config = configured(options)

@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import field, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -21,6 +21,7 @@ from illuminerf import (
     models,
     orb_illumination_study,
     pipeline,
+    rotating_light,
     stanford_orb,
 )
 from illuminerf.batch.command import batch_command
@@ -45,10 +46,10 @@ from illuminerf.stages import (
     render_novel_views,
     render_radiance_cues,
     render_training_pairs,
-    rotate_light,
     train_relighting_model,
     use_mesh,
 )
+from illuminerf.workflow.atomic import explained_errors
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say
 from illuminerf.workflow.task_pool import Execution
@@ -56,7 +57,7 @@ from illuminerf.workflow.task_pool import Execution
 PositionalPath = Annotated[Path, tyro.conf.Positional]
 _DEFAULT_PREVIEW = preview_training_pairs.Config()
 _ALL_CORES = Execution()
-_ONE_TURN = rotate_light.Config()
+_ONE_TURN = rotating_light.Config()
 
 
 def relight_command(
@@ -138,7 +139,7 @@ def rotate_light_command(
     out: Path,
     light: str | None = None,
     model: str = "embedded",
-    config: Annotated[rotate_light.Config, tyro.conf.arg(name="")] = _ONE_TURN,
+    config: Annotated[rotating_light.Config, tyro.conf.arg(name="")] = _ONE_TURN,
 ) -> None:
     """Film one photograph of a finished run while the light turns about it: rotating.mp4 and .gif.
 
@@ -149,7 +150,7 @@ def rotate_light_command(
         model: The relighting model: a folder, embedded or dilightnet.
         config: Which photograph, and how the light turns.
     """
-    say(f"done: {films.rotate_light(RunFolder(run), out, light, model, config)}")
+    say(f"done: {rotating_light.film(RunFolder(run), out, light, model, config)}")
 
 
 def demo_command(out: Path = Path("runs/demo"), device: str = "auto", seed: int = 0) -> None:
@@ -430,25 +431,31 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     warnings.showwarning = lambda message, *_: say(f"[yellow]warning:[/yellow] {escape(str(message))}", markup=True)
     try:
-        if arguments[:1] and arguments[0] in GROUPS:
-            group = arguments[0]
-            tyro.extras.subcommand_cli_from_dict(GROUPS[group], prog=f"illuminerf {group}", args=arguments[1:])
-        else:
-            chosen = tyro.extras.subcommand_cli_from_dict(
-                COMMANDS,
-                prog="illuminerf",
-                description="Relight photographed objects. Also: "
-                + ", ".join(f"illuminerf {name} --help" for name in GROUPS),
-                args=arguments,
-            )
-            if isinstance(chosen, StageCall):
-                chosen.execute()
+        with explained_errors(Path.cwd()):
+            _execute(arguments)
     except UserError as error:
         say(f"[bold red]error:[/bold red] {escape(str(error))}", markup=True)
         sys.exit(2)
     except KeyboardInterrupt:
         say("stopped; run the same command again to go on")
         sys.exit(130)
+
+
+def _execute(arguments: Sequence[str]) -> None:
+    """Run the subcommand that the arguments name."""
+    if arguments[:1] and arguments[0] in GROUPS:
+        group = arguments[0]
+        tyro.extras.subcommand_cli_from_dict(GROUPS[group], prog=f"illuminerf {group}", args=arguments[1:])
+    else:
+        chosen = tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="illuminerf",
+            description="Relight photographed objects. Also: "
+            + ", ".join(f"illuminerf {name} --help" for name in GROUPS),
+            args=arguments,
+        )
+        if isinstance(chosen, StageCall):
+            chosen.execute()
 
 
 __all__ = ["COMMANDS", "GROUPS", "Preset", "main"]

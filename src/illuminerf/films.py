@@ -10,12 +10,10 @@ from illuminerf.run_folder import RelitObject, RunFolder
 from illuminerf.scene.images import read_png
 from illuminerf.scene.video import write_gif, write_mp4
 from illuminerf.stages import render_novel_views
-from illuminerf.stages import rotate_light as rotate_light_stage
 from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.errors import UserError
 
 _SECONDS_PER_TURN = 4.0
-_ONE_TURN = rotate_light_stage.Config()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,42 +81,6 @@ def render(
     if gif:
         write_gif(out / "film.gif", (on_white(read_png(frame)) for frame in frames), rate)
     return Film(out / "film.mp4", out / "film.gif" if gif else None, frames, sorted((views / "linear").glob("*.exr")))
-
-
-def rotate_light(
-    run: RunFolder,
-    out: Path,
-    light: str | None = None,
-    model: str = "embedded",
-    config: rotate_light_stage.Config = _ONE_TURN,
-) -> Path:
-    """A film of one photograph of a finished run under one of its lights, which makes one turn.
-
-    Args:
-        run: the run.
-        out: folder of the frames and the film.
-        light: one of the run's lights; None where it has only one.
-        model: the relighting model: a folder, embedded or dilightnet.
-        config: which photograph, how many frames.
-
-    Returns:
-        The MP4.
-
-    Raises:
-        UserError: no such run, light or photograph, or `out` was made with other settings.
-    """
-    relit = run.light(light)
-    own_light = run.folder / "illumination"
-    made = rotate_light_stage.run(
-        run.folder / "geometry",
-        run.capture,
-        relit.folder / "cues" / "light.exr",
-        model,
-        own_light if own_light.is_dir() else None,
-        config,
-        out,
-    )
-    return made / "rotating.mp4"
 
 
 def write_turntable_gif(relit: RelitObject) -> Path:

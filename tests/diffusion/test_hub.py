@@ -62,6 +62,22 @@ def test_a_wrong_file_is_refused_and_removed(served: StandInHub) -> None:
     assert not (repository_folder(SD21.id) / "unet" / "config.json").exists()
 
 
+def test_what_has_no_pinned_sum_is_held_to_the_hubs_and_to_the_first_download(served: StandInHub) -> None:
+    download("dilightnet")
+    folder, name = repository_folder(DILIGHTNET_CONTROL.id), "config.json"
+    (folder / name).write_text("damaged")
+    served.asked.clear()
+    download("dilightnet")
+    assert served.asked == [(DILIGHTNET_CONTROL.id, name, DILIGHTNET_CONTROL.revision)]
+    assert (folder / name).read_text() == name
+    note = folder / ".cache" / "huggingface" / "download" / f"{name}.metadata"
+    note.parent.mkdir(parents=True)
+    note.write_text(f"commit\n{'0' * 64}\n0.0\n")
+    (folder / name).unlink()
+    with pytest.raises(UserError, match="not the expected file"):
+        download("dilightnet")
+
+
 def test_another_base_and_revision(served: StandInHub) -> None:
     download("paper", base="someone/diffusion")
     assert ("someone/diffusion", "unet/diffusion_pytorch_model.safetensors", "main") in served.asked

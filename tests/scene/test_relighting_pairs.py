@@ -1,5 +1,7 @@
 """Items on disk: what comes back is what went in, as far as the format holds it."""
 
+import hashlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -7,8 +9,10 @@ import pytest
 from safetensors.numpy import load, save
 
 from illuminerf.scene.images import srgb_from_linear
-from illuminerf.scene.relighting_pairs import decode_item, encode_item
+from illuminerf.scene.relighting_pairs import decode_item, encode_item, iterate_items
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.shards import sample_tar, write_shard
+from illuminerf.workflow.storage import Storage
 
 
 def arrays(seed: int = 0) -> dict[str, Any]:
@@ -53,6 +57,35 @@ def test_only_covered_pixels_take_room() -> None:
     content = encode_item(**before, metadata={})["safetensors"]
     covered = int((np.rint(before["alpha"] * 255) > 0).sum())
     assert load(content)["cues"].shape == (3, 12, covered)
+
+
+def sealed(folder: Path, names: tuple[str, ...]) -> Path:
+    """Shards of one item each, and a manifest, as the stage leaves them."""
+    storage = Storage(folder)
+    shards = {}
+    for number, name in enumerate(names):
+        item = sample_tar(f"cat_{number}", encode_item(**arrays(number), metadata={}))
+        shards[name] = {"sha256": write_shard(storage, name, [item], {}).sha256}
+    storage.write_json("manifest.json", {"shards": shards})
+    storage.write("DONE", (hashlib.sha256(storage.read("manifest.json")).hexdigest() + "\n").encode())
+    return folder
+
+
+def test_a_shard_whose_index_is_damaged_is_not_passed_over(tmp_path: Path) -> None:
+    folder = sealed(tmp_path / "pairs", ("pairs-000000", "pairs-000001"))
+    assert [key for key, _, _ in iterate_items(folder)] == ["cat_0", "cat_1"]
+    index = folder / "pairs-000001.json"
+    content = index.read_bytes()
+    for spoilt in (content[:-20], content.replace(b'"sha256": "', b'"sha256": "0')):
+        index.write_bytes(spoilt)
+        with pytest.raises(UserError, match="pairs-000001 is damaged"):
+            next(iterate_items(folder))
+    index.write_bytes(content)
+    (folder / "manifest.json").write_text('{"shards": {}}')
+    with pytest.raises(UserError, match=r"manifest\.json is damaged"):
+        next(iterate_items(folder))
+    (folder / "DONE").unlink()  # a run under way has no say yet
+    assert len(list(iterate_items(folder))) == 2
 
 
 def test_damage_is_explained() -> None:

@@ -23,6 +23,15 @@ def test_a_resumed_log_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     assert lines[2] == {"kind": "train", "step": 3, "loss": 1 / 3}  # and nothing that differs from run to run
 
 
+def test_a_record_made_twice_is_written_once(tmp_path: Path) -> None:
+    """A run that is killed after its last record makes it again."""
+    MetricsLog(tmp_path, 0).write("validation", 4, {"psnr": 20.0})
+    resumed = MetricsLog(tmp_path, 4)
+    resumed.write("validation", 4, {"psnr": 20.0})
+    resumed.write("validation", 4, {"psnr": 21.0})
+    assert [json.loads(line)["psnr"] for line in resumed.path.read_text().splitlines()] == [20.0, 21.0]
+
+
 def test_a_fresh_run_starts_a_fresh_log(tmp_path: Path) -> None:
     MetricsLog(tmp_path, 0).write("train", 1, {"loss": 1.0})
     assert MetricsLog(tmp_path, 0).path.read_bytes() == b""

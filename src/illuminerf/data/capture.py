@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from illuminerf.data.decoding import image_size
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.images import read_png_bytes, write_png
 from illuminerf.scene.views import EightBitImages, Views
@@ -102,6 +103,18 @@ def load_cameras(folder: Path) -> Cameras:
     return Cameras.from_dict(read_json(folder / "cameras.json"))
 
 
+def _check_size(folder: Path, cameras: Cameras) -> None:
+    """UserError where the first image is of another size than the cameras say, before memory is spent by their word."""
+    size = image_size(image_path(folder, 0))
+    if size != (cameras.width, cameras.height):
+        raise UserError(
+            f"image 0 of the capture {folder} has the wrong shape",
+            got=f"{size[1]} x {size[0]}",
+            wanted=f"{cameras.height} x {cameras.width}",
+            fix="import the capture again into a new folder",
+        )
+
+
 def load_capture(folder: Path) -> Capture:
     """Read the capture in `folder`.
 
@@ -110,6 +123,8 @@ def load_capture(folder: Path) -> Capture:
     cameras = load_cameras(folder)
     content = read_json(folder / "capture.json")
     num_views = len(cameras)
+    if num_views:
+        _check_size(folder, cameras)
     pixels = np.empty((num_views, cameras.height, cameras.width, 4), np.uint8)
 
     def read(view: int) -> None:
@@ -133,7 +148,7 @@ def load_capture(folder: Path) -> Capture:
             np.array(content["offset"], np.float64),
             "masked" if content["background"] == "masked" else "opaque",
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise UserError(
             f"{folder / 'capture.json'} is not that of a capture",
             got=f"{type(error).__name__}: {error}",

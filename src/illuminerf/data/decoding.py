@@ -5,8 +5,6 @@ straight alpha; EXR holds linear RGB, premultiplied. CMYK is refused: without it
 guess.
 """
 
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,7 @@ import OpenEXR
 from PIL import Image
 
 from illuminerf.data.deep_png import is_deep_colour_png, read_deep_png
-from illuminerf.scene.images import read_exr, srgb_from_linear
+from illuminerf.scene.images import DECODING_ERRORS, read_exr, srgb_from_linear
 from illuminerf.workflow.errors import UserError
 
 MAX_PIXELS = 120_000_000
@@ -23,7 +21,7 @@ MAX_PIXELS = 120_000_000
 EXIF_ORIENTATION = 0x0112
 _TURNED = (5, 6, 7, 8)
 """Orientations that swap width and height."""
-_DECODING_ERRORS = (OSError, SyntaxError, ValueError, EOFError, RuntimeError, KeyError, struct.error, zlib.error)
+_DECODING_ERRORS = DECODING_ERRORS
 
 
 def _unreadable(path: Path, error: BaseException) -> UserError:

@@ -81,7 +81,7 @@ def _read_intrinsics(
         fx, fy, cx, cy = (float(entry["intrinsics"][key]) for key in ("fx", "fy", "cx", "cy"))
         given = entry.get("distortion", {})
         distortion = [float(given.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2", "k3")]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise UserError(
             f"the camera of {image.name} is not complete",
             got=f"{type(error).__name__} {error} in {path}",

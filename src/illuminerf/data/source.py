@@ -118,7 +118,7 @@ def rigid_pose(matrix: object, where: str) -> np.ndarray:
     """
     try:
         pose = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
     if pose.size in (12, 16) and pose.ndim == 1:
         pose = pose.reshape(-1, 4)

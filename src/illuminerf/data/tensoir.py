@@ -97,7 +97,7 @@ def _read_metadata(view: TensoirView, size: tuple[int, int]) -> tuple[np.ndarray
         values = [float(value) for value in matrix.split(",")] if isinstance(matrix, str) else matrix
         fov_radians = float(content["cam_angle_x"])
         declared = (int(content.get("imw", size[0])), int(content.get("imh", size[1])))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise UserError(
             "the metadata of a benchmark view is not what it should be",
             got=f"{type(error).__name__} {error} in {path}",

@@ -53,7 +53,8 @@ def read_transforms(root: Path, split: str = "train", mask_folder: str = "masks"
         _read_frame(root, path, content, entry, index, mask_folder)
         for index, entry in enumerate(_entries_of_split(content, split))
     ]
-    per_frame = all(any(key in entry for key in _INTRINSIC_KEYS) for entry in content["frames"])
+    described = [entry for entry in content["frames"] if isinstance(entry, dict)]
+    per_frame = all(any(key in entry for key in _INTRINSIC_KEYS) for entry in described)
     return checked_capture(root, frames, shares_intrinsics=not per_frame)
 
 
@@ -107,6 +108,8 @@ def _read_camera(keys: dict[str, Any], image: Path, where: str) -> SourceCamera:
         declared = (int(keys["w"]), int(keys["h"])) if "w" in keys and "h" in keys else None
         size = image_size(image, declared)
         width, height = declared or size
+        if min(width, height) < 1:
+            raise ValueError(f"w {width}, h {height}")
         if abs(width * size[1] - height * size[0]) > max(width, height, *size):
             raise UserError(
                 f"{where}: the image has another shape than its intrinsics",
@@ -117,7 +120,7 @@ def _read_camera(keys: dict[str, Any], image: Path, where: str) -> SourceCamera:
         fx, fy = _focal_lengths(keys, width, height, where)
         centre = float(keys.get("cx", width / 2)), float(keys.get("cy", height / 2))
         distortion = [float(keys.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2", "k3")]
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{where}: intrinsics are not numbers", got=str(error), wanted="numbers in pixels") from error
     to_x, to_y = size[0] / width, size[1] / height
     return checked_camera(where, size, (fx * to_x, fy * to_y), (centre[0] * to_x, centre[1] * to_y), distortion)

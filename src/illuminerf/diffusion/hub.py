@@ -6,6 +6,7 @@ Nothing here runs unasked: only `illuminerf models download` reaches out. A repo
 
 import hashlib
 import os
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from huggingface_hub import hf_hub_download
 from huggingface_hub.errors import EntryNotFoundError, HfHubHTTPError, HFValidationError
 
 from illuminerf.diffusion.dilightnet import DILIGHTNET
+from illuminerf.workflow.atomic import read_json, write_json
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say
 
@@ -198,7 +200,7 @@ def download(name: str, base: str = "", revision: str = "") -> list[Path]:
 
 
 def _unknown(files: tuple[HubFile, ...]) -> tuple[HubFile, ...]:
-    """Of another revision no checksum is known."""
+    """Of another revision no checksum is pinned."""
     return tuple(HubFile(file.path) for file in files)
 
 
@@ -206,7 +208,8 @@ def _fetch(repository: HubRepository, file: HubFile, wanted: list[HubRepository]
     target = repository_folder(repository.id) / file.path
     # A revision that was asked for by name has no checksums: the hub's client decides whether a file is current.
     is_known = repository.revision in (known.revision for known in (SD21, DILIGHTNET_CONTROL))
-    if is_known and target.is_file() and (not file.sha256 or _sha256(target) == file.sha256):
+    recorded = _recorded(repository).get(file.path, "")
+    if is_known and target.is_file() and _sha256(target) == (file.sha256 or recorded or _sha256(target)):
         return
     say(f"{repository.id}: {file.path}" + (f" ({file.size_bytes / 1e6:.0f} MB)" if file.size_bytes > 1e6 else ""))
     try:
@@ -220,13 +223,33 @@ def _fetch(repository: HubRepository, file: HubFile, wanted: list[HubRepository]
             wanted=placement(wanted),
             fix="try again where the hub can be reached, or put these files there by hand",
         ) from error
-    if file.sha256 and _sha256(target) != file.sha256:
+    found, expected = _sha256(target), file.sha256 or _sum_of_hub(repository, file)
+    if expected and found != expected:
         target.unlink()
         raise UserError(
             f"{file.path} of {repository.id} is not the expected file, and was removed",
-            wanted=f"sha256 {file.sha256}",
+            wanted=f"sha256 {expected}",
             fix="download it again",
         )
+    if not file.sha256:
+        write_json(_record(repository), _recorded(repository) | {file.path: found})
+
+
+def _record(repository: HubRepository) -> Path:
+    return repository_folder(repository.id) / "downloaded.json"
+
+
+def _recorded(repository: HubRepository) -> dict[str, str]:
+    """The sha256 that files had when they were downloaded, by path, of those that have no pinned one."""
+    record = _record(repository)
+    return dict(read_json(record)) if record.is_file() else {}
+
+
+def _sum_of_hub(repository: HubRepository, file: HubFile) -> str:
+    """The sha256 that the hub itself names for a large file, as its client notes it beside the download; else ""."""
+    note = repository_folder(repository.id) / ".cache" / "huggingface" / "download" / f"{file.path}.metadata"
+    lines = note.read_text(errors="replace").splitlines() if note.is_file() else []
+    return lines[1] if len(lines) > 1 and re.fullmatch("[0-9a-f]{64}", lines[1]) else ""
 
 
 def _sha256(path: Path) -> str:

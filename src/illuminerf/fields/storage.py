@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from illuminerf.fields.bounds import OccupiedCells
+from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
 from illuminerf.workflow.atomic import read_json, write_json
 from illuminerf.workflow.checkpoint import load_checkpoint, save_checkpoint
@@ -14,6 +15,7 @@ from illuminerf.workflow.config import from_json, to_json
 from illuminerf.workflow.errors import UserError
 
 _FORMAT = 1
+_MOST = 64
 
 
 @dataclass
@@ -35,6 +37,25 @@ def save_field(folder: Path, stored: StoredField) -> None:
     write_json(folder / "field.json", {"format": _FORMAT, "field": to_json(stored.field.config)})
 
 
+def _check_sizes(folder: Path, config: FieldConfig, tensors: dict[str, Tensor]) -> None:
+    """UserError where field.json is not of these tensors, before memory is spent by its word."""
+    too_deep = max(grid.num_levels for grid in _grids(config)) > _MOST or config.appearance.num_hidden_layers > _MOST
+    if not too_deep:
+        with torch.device("meta"):
+            wanted = {name: tensor.shape for name, tensor in RadianceField(config).state_dict().items()}
+        different = [name for name, shape in wanted.items() if name not in tensors or tensors[name].shape != shape]
+    if too_deep or different:
+        raise UserError(
+            f"{folder}/field.safetensors does not fit field.json",
+            got="more than 64 levels or layers" if too_deep else f"another {different[0]}",
+            fix="run the stage that makes the field again",
+        )
+
+
+def _grids(config: FieldConfig) -> tuple[HashGridConfig, ...]:
+    return (config.surface.grid, config.surface.normal_grid, config.appearance.grid, config.proposal.grid)
+
+
 def load_field(folder: Path, device: torch.device | str = "cpu") -> StoredField:
     """Read what `save_field` wrote, in evaluation mode.
 
@@ -44,8 +65,10 @@ def load_field(folder: Path, device: torch.device | str = "cpu") -> StoredField:
     header = read_json(folder / "field.json")
     if not isinstance(header, dict) or header.get("format") != _FORMAT:
         raise UserError(f"{folder} holds no field of this version", wanted=f"format {_FORMAT}")
-    field = RadianceField(from_json(FieldConfig, header.get("field", {})))
+    config = from_json(FieldConfig, header.get("field", {}))
     tensors, _ = load_checkpoint(folder / "field.safetensors")
+    _check_sizes(folder, config, tensors)
+    field = RadianceField(config)
     try:
         cells = OccupiedCells(tensors.pop("occupied_cells").bool().to(device))
         latents = tensors.pop("latents", None)

@@ -127,7 +127,7 @@ class Cameras:
         }
 
     @staticmethod
-    def from_dict(content: dict[str, Any]) -> "Cameras":
+    def from_dict(content: Any) -> "Cameras":
         """Read what `to_dict` made.
 
         Raises:
@@ -138,8 +138,11 @@ class Cameras:
             poses = np.array([frame["world_from_camera"] for frame in frames], np.float64).reshape(len(frames), 4, 4)
             names = ("fx", "fy", "cx", "cy")
             intrinsics = np.array([[frame["intrinsics"][n] for n in names] for frame in frames], np.float64)
-            return Cameras(poses, intrinsics.reshape(len(frames), 4), int(content["height"]), int(content["width"]))
-        except (KeyError, TypeError, ValueError) as error:
+            height, width = int(content["height"]), int(content["width"])
+            if min(height, width) < 1:
+                raise ValueError(f"{width} x {height} pixels")
+            return Cameras(poses, intrinsics.reshape(len(frames), 4), height, width)
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise UserError(
                 "cameras are not in the expected form",
                 got=f"{type(error).__name__}: {error}",

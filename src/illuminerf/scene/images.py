@@ -1,5 +1,9 @@
 """Images: sRGB coding, compositing, PNG and EXR files. Arrays are [..., height, width, channels]."""
 
+import errno
+import struct
+import warnings
+import zlib
 from pathlib import Path
 from typing import TypeVar
 
@@ -13,6 +17,14 @@ from illuminerf.workflow.atomic import atomic_path
 from illuminerf.workflow.errors import UserError
 
 Array = TypeVar("Array", np.ndarray, Tensor)
+MAX_PIXELS = 2**27
+"""Of one picture (16384 x 8192, the largest lights). Larger ones are refused before they are decoded: a few kilobytes
+can unpack to gigabytes."""
+_MAX_VALUES = 2**29
+"""Of all channels of an EXR together: 2 GiB as float32."""
+DECODING_ERRORS = (OSError, SyntaxError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, EOFError,
+                   RuntimeError, struct.error, zlib.error)  # fmt: skip
+"""What image libraries raise on broken content."""
 
 
 def srgb_from_linear(linear_rgb: Array) -> Array:
@@ -58,13 +70,27 @@ def read_png_bytes(path: Path) -> np.ndarray:
         UserError: the file is missing or not an image.
     """
     try:
-        with Image.open(path) as image:
-            mode = "RGBA" if "A" in image.getbands() else "RGB"
-            return np.asarray(image.convert(mode))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit is checked
+            with Image.open(path) as image:
+                check_size(path, *image.size)
+                mode = "RGBA" if "A" in image.getbands() else "RGB"
+                return np.asarray(image.convert(mode))
     except FileNotFoundError as error:
         raise UserError(f"{path} is missing", fix="check the path") from error
-    except (OSError, SyntaxError, ValueError) as error:
+    except (Image.DecompressionBombError, *DECODING_ERRORS) as error:
         raise UserError(f"{path} is not a readable image", got=str(error), fix="export it again as PNG") from error
+
+
+def check_size(path: Path, width: int, height: int, num_channels: int = 1) -> None:
+    """UserError where a picture has no pixels or too many."""
+    if width < 1 or height < 1 or width * height > MAX_PIXELS or width * height * num_channels > _MAX_VALUES:
+        raise UserError(
+            f"{path} has an impossible size",
+            got=f"{width} x {height} pixels, {num_channels} channels",
+            wanted=f"at least one pixel, at most {MAX_PIXELS:,}, and at most {_MAX_VALUES:,} values",
+            fix="export it smaller",
+        )
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
@@ -87,9 +113,14 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
     if not Path(path).is_file():
         raise UserError(f"{path} is missing", wanted="an EXR file", fix="check the path")
     try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            header = file.header()
+            low, high = header["dataWindow"]
+            size = [int(last) - int(first) + 1 for first, last in zip(low, high, strict=True)]
+            check_size(path, size[0], size[1], max(len(header["channels"]), 1))
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return {name: np.asarray(c.pixels, np.float32) for name, c in file.channels().items()}
-    except (RuntimeError, TypeError, ValueError) as error:
+    except DECODING_ERRORS as error:
         raise UserError(f"{path} is not a readable EXR", got=str(error), fix="export it again") from error
 
 
@@ -103,7 +134,10 @@ def write_exr(path: Path, channels: dict[str, np.ndarray], half: bool = True) ->
     pixels = {name: np.ascontiguousarray(np.clip(c, -limit, limit).astype(kind)) for name, c in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary:
-        OpenEXR.File(header, pixels).write(str(temporary))
+        try:
+            OpenEXR.File(header, pixels).write(str(temporary))
+        except RuntimeError as error:  # it does not say whether the disk was full
+            raise OSError(errno.EIO, str(error), str(path)) from error
 
 
 def read_rgb_exr(path: Path) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 
 from illuminerf.scene.images import linear_from_srgb, to_uint8
+from illuminerf.scene.mesh_claims import check_claims
 from illuminerf.workflow.atomic import write_bytes
 from illuminerf.workflow.errors import UserError
 
@@ -84,10 +85,11 @@ class TriangleMesh:
 def _loaded(path: Path, kind: str, file_from_world: np.ndarray) -> TriangleMesh:
     if not Path(path).is_file():
         raise UserError(f"{path} is missing", wanted=f"a .{kind} mesh")
+    check_claims(path, kind)
     try:
         scene = trimesh.load_scene(str(path), file_type=kind, process=False)
         placed = [_placed(scene, node, file_from_world) for node in scene.graph.nodes_geometry]
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+    except Exception as error:  # what broken files make of the library, no list foresees
         raise UserError(
             f"{path} is not a readable {kind.upper()} mesh", got=str(error), fix="export it again"
         ) from error

@@ -7,7 +7,8 @@ import numpy as np
 
 from illuminerf.workflow.errors import UserError
 
-_MAX_PIXELS = 2**28
+_MAX_PIXELS = 2**27
+_LONGEST_RUN = 127
 
 
 def read_hdr(path: Path) -> np.ndarray:
@@ -47,6 +48,9 @@ def _scanlines(body: np.ndarray, height: int, width: int) -> np.ndarray:
         if len(body) < height * width * 4:
             raise ValueError(f"{len(body)} bytes of pixels where {height * width * 4} are needed")
         return body[: height * width * 4].reshape(height, width, 4)
+    least = 4 + 4 * 2 * -(-width // _LONGEST_RUN)  # bytes of a scanline of runs alone
+    if len(body) < height * least:
+        raise ValueError(f"{len(body)} bytes of pixels where at least {height * least} are needed")
     rgbe = np.empty((height, 4, width), np.uint8)
     position = 0
     for row in range(height):

@@ -13,6 +13,7 @@ permutation, scale), dent_tilts_degrees (empty: exact cues), camera, coverage, l
 From k lights come k * (k - 1) ordered pairs: input under one light, cues and target under another.
 """
 
+import hashlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -103,7 +104,7 @@ def iterate_items(out: str | Path) -> Iterator[Item]:
         UserError: a shard is damaged.
     """
     storage = Storage(out)
-    for index in finished_shards(storage):
+    for index in _shards(storage):
         yield from _items(storage, index)
 
 
@@ -114,12 +115,34 @@ def spread_items(out: str | Path, wanted: int) -> Iterator[Item]:
         UserError: one of these shards is damaged.
     """
     storage = Storage(out)
-    indices = finished_shards(storage)
+    indices = _shards(storage)
     keys = [key for index in indices for key in index.keys]
     shown = {keys[i] for i in np.linspace(0, len(keys) - 1, min(wanted, len(keys))).round().astype(int)}
     for index in indices:
         if shown & set(index.keys):
             yield from (item for item in _items(storage, index) if item[0] in shown)
+
+
+def _shards(storage: Storage) -> list[ShardIndex]:
+    """All shards; where the run that made them is finished, those of its manifest.
+
+    Raises:
+        UserError: the manifest is damaged, or names a shard that is missing or another one.
+    """
+    found = finished_shards(storage)
+    try:
+        sealed, content = storage.read("DONE"), storage.read("manifest.json")
+    except FileNotFoundError:  # unfinished, or shards from elsewhere
+        return found
+    fix = "render the pairs again with the same command: it mends what is damaged"
+    if sealed.strip() != hashlib.sha256(content).hexdigest().encode():
+        raise UserError(f"{storage.url}/manifest.json is damaged", got="another sha256 than DONE says", fix=fix)
+    listed = {name: shard["sha256"] for name, shard in json.loads(content)["shards"].items()}
+    present = {index.name: index.sha256 for index in found}
+    for name in sorted({*listed, *present}):
+        if listed.get(name) != present.get(name):
+            raise UserError(f"{storage.url}/{name} is damaged or not of this run", got=present.get(name, ""), fix=fix)
+    return found
 
 
 def _items(storage: Storage, index: ShardIndex) -> Iterator[Item]:

@@ -69,7 +69,7 @@ def run(geometry: Path, capture: Path, config: Config, out: Path) -> Path:
             return out
         views = load_capture(capture).views
         mesh = TriangleMesh.load_glb(geometry / "mesh.glb")
-        if not (out / "light.json").exists():
+        if not ((out / "light.json").exists() and (out / "light.exr").exists()):
             light, metrics = estimated_light(mesh, views, config)
             light.save(out / "light.exr")
             write_json(out / "light.json", metrics)

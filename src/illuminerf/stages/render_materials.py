@@ -64,7 +64,7 @@ def run(materials: Path, cameras_path: Path, light: Path, config: Config, out: P
         radiance = EnvironmentMap.load(light)
         radiance = radiance.resized(min(radiance.linear_rgb.shape[0], config.max_light_height))
         scene = ShadedScene([(mesh, material)], radiance, config.device)
-        missing = [view for view in range(len(cameras)) if not _paths(out, view)[1].exists()]
+        missing = [view for view in range(len(cameras)) if not all(path.exists() for path in _paths(out, view))]
         with step_progress("render materials", len(cameras), len(cameras) - len(missing)) as progress:
             for view in missing:
                 seed = derived_seed(config.seed, "view", view)
@@ -76,7 +76,7 @@ def run(materials: Path, cameras_path: Path, light: Path, config: Config, out: P
 
 
 def _paths(out: Path, view: int) -> tuple[Path, Path]:
-    """Image and linear image of a view; the second is written last."""
+    """Image and linear image of a view."""
     return out / "images" / f"{view:03d}.png", out / "linear" / f"{view:03d}.exr"
 
 

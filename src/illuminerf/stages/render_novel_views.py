@@ -93,7 +93,7 @@ def run(latent_nerf_path: Path, cameras_path: Path | None, config: Config, out: 
         latent = _latent(stored, config.latent_index)
         cameras = _cameras(cameras_path, config.turntable)
         for view in track(range(len(cameras)), "render novel views"):
-            if not _paths(out, view)[1].exists():
+            if not all(path.exists() for path in _paths(out, view)):
                 _write_view(render(cameras, view, latent), view, out)
         write_json(out / "cameras.json", cameras.to_dict())
         artefact.finish({"num_views": len(cameras)})
@@ -101,7 +101,7 @@ def run(latent_nerf_path: Path, cameras_path: Path | None, config: Config, out: 
 
 
 def _paths(out: Path, view: int) -> tuple[Path, Path]:
-    """Image and linear image of a view; the second is written last."""
+    """Image and linear image of a view."""
     return out / "images" / f"{view:03d}.png", out / "linear" / f"{view:03d}.exr"
 
 

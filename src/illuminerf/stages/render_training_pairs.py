@@ -13,7 +13,8 @@ import hashlib
 import json
 import time
 from collections import Counter
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,12 +24,13 @@ from illuminerf.cues.object_views import ObjectFile, ViewSettings
 from illuminerf.cues.shard_driver import LIGHTS_FOLDER, clear, finished_pairs, nothing_rendered, render_missing
 from illuminerf.cues.training_shards import Plan
 from illuminerf.data.object_collection import ObjectChoice, list_objects
-from illuminerf.workflow.artefact import fingerprint, locked, provenance, refuse_other_key
+from illuminerf.workflow.artefact import fingerprint, is_stranger, locked, provenance, refuse_other_key
+from illuminerf.workflow.atomic import explained_errors
 from illuminerf.workflow.config import to_json
 from illuminerf.workflow.device import numpy_generator
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say, step_progress
-from illuminerf.workflow.shards import ShardIndex
+from illuminerf.workflow.shards import ShardIndex, remove_shard
 from illuminerf.workflow.storage import Storage
 from illuminerf.workflow.task_pool import Execution, open_pool
 
@@ -82,7 +84,7 @@ def run(objects: Path, lights: Path, config: Config, out: str | Path, execution:
     key = {"schema": SCHEMA, "stage": STAGE, "config": to_json(_keyed(config))}
     made_from = {"objects": _collection_digest(collection), "lights": _lights_digest(maps)}
     start = time.monotonic()
-    with locked(storage.path) if storage.path else nullcontext():
+    with _place(storage):
         _check_key(storage, key, made_from)
         storage.remove_leftovers()
         storage.write_json("config.json", key)
@@ -90,7 +92,12 @@ def run(objects: Path, lights: Path, config: Config, out: str | Path, execution:
         with open_pool(execution) as pool:
             finished = finished_pairs(storage, plan, pool)
             if len(finished) == len(plan.shards()) and _is_sealed(storage):
-                return out
+                if _left_out(finished) == json.loads(storage.read("manifest.json"))["left_out"]:
+                    return out
+                say("what was left out is not what the manifest says: the shards that say so are made again")
+                for name in [name for name, index in finished.items() if index.left_out]:
+                    remove_shard(storage, name)
+                    del finished[name]
             storage.remove("DONE")
             usable, unusable = _store_lights(storage, maps, config.views)
             plan = replace(plan, lights=usable)
@@ -104,6 +111,20 @@ def run(objects: Path, lights: Path, config: Config, out: str | Path, execution:
         storage.write_json("provenance.json", provenance(time.monotonic() - start, rendered))
         storage.write("DONE", _digest(storage, "manifest.json"))
     return out
+
+
+@contextmanager
+def _place(storage: Storage) -> Iterator[None]:
+    """Hold the lock of a folder on this machine, and say in one line what is wrong with its disk."""
+    lock = locked(storage.path) if storage.path else nullcontext()
+    with explained_errors(storage.path or Path(storage.url)), lock:
+        yield
+
+
+def _left_out(shards: dict[str, ShardIndex]) -> dict[str, Any]:
+    """By key, why items are missing."""
+    left_out = {key: why for index in shards.values() for key, why in index.left_out.items()}
+    return {key: to_json(why) for key, why in sorted(left_out.items())}
 
 
 def _keyed(config: Config) -> Config:
@@ -161,7 +182,7 @@ def _check_key(storage: Storage, key: dict[str, Any], made_from: dict[str, str])
     try:
         old_key, old_inputs = (json.loads(storage.read(name)) for name in ("config.json", "inputs.json"))
     except (FileNotFoundError, ValueError):
-        strangers = [name for name, _ in storage.entries() if name not in ("config.json", "inputs.json", ".lock")]
+        strangers = [name for name, _ in storage.entries() if is_stranger(name)]
         if strangers:
             raise UserError(
                 f"{storage.url} holds files that are not a run of this program",
@@ -187,7 +208,7 @@ def _is_sealed(storage: Storage) -> bool:
 def _manifest(
     plan: Plan, config: Config, shards: dict[str, ShardIndex], unusable_lights: dict[str, str]
 ) -> dict[str, Any]:
-    left_out = {key: why for index in shards.values() for key, why in index.left_out.items()}
+    left_out = _left_out(shards)
     num_items = sum(len(index.keys) for index in shards.values())
     num_lights = plan.views.num_lights
     return {
@@ -199,8 +220,8 @@ def _manifest(
             for name, index in sorted(shards.items())
         },
         "excluded": sorted(config.choice.excluded),
-        "left_out": {key: to_json(why) for key, why in sorted(left_out.items())},
-        "left_out_by_reason": dict(sorted(Counter(why.reason for why in left_out.values()).items())),
+        "left_out": left_out,
+        "left_out_by_reason": dict(sorted(Counter(why["reason"] for why in left_out.values()).items())),
         "lights": light_names(plan.lights),
         "lights_left_out": dict(sorted(unusable_lights.items())),
         "licences": {item.id: item.licence for item in sorted(plan.objects, key=lambda item: item.id) if item.licence},

@@ -142,12 +142,13 @@ class _Training:
                     progress.advance(1, **shown)
                 now = time.monotonic()
                 self.seconds = now - started
-                if self.log is not None and now - checked > self.config.checkpoint_seconds:
-                    self.save()
-                    checked = now
                 if self.log is not None and self.step % every.validation_steps == 0:
                     self.validate(every.validation_pairs)
                     logged = time.monotonic()
+                # after the validation: a run that goes on from here would never make up for one
+                if self.log is not None and now - checked > self.config.checkpoint_seconds:
+                    self.save()
+                    checked = now
         self.stream.close()
 
     def finish(self) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from illuminerf.workflow.checksums import is_artefact, verify_once
 from illuminerf.workflow.errors import UserError
 
 _AGAIN = "run the same relight command again; it goes on where it stopped"
@@ -30,7 +31,7 @@ def find_run(folder: Path) -> FinishedRun:
     """The run in `folder`.
 
     Raises:
-        UserError: it does not exist, is no run, or has nothing finished to show.
+        UserError: it does not exist, is no run, has nothing finished to show, or is damaged.
     """
     if not folder.is_dir():
         raise UserError(f"the run {folder} does not exist", wanted="a folder that 'illuminerf relight' wrote")
@@ -49,5 +50,8 @@ def find_run(folder: Path) -> FinishedRun:
     lights = {name: path for name, path in found.items() if (path / "latent_nerf" / "DONE").is_file()}
     if not lights:
         raise UserError(f"the run {folder} is unfinished", got="no light with a finished latent_nerf", fix=_AGAIN)
+    for artefact in (folder / "capture", folder / "geometry", *(path / "latent_nerf" for path in lights.values())):
+        if is_artefact(artefact):
+            verify_once(artefact)
     unfinished = tuple(name for name in found if name not in lights)
     return FinishedRun(folder, folder / "capture", folder / "geometry", lights, unfinished)

@@ -4,9 +4,11 @@ A folder holds the stage's typed files and
     config.json      the stage and its config
     inputs.json      the fingerprints of what it was made from
     provenance.json  versions, device, seconds, peak memory
+    checksums.json   the sha256 of every file
     DONE             the artefact's own fingerprint; written last, by an atomic rename
 Same key and DONE: load. Same key, unfinished: resume. Another key: refuse and say which field differs. Keys of earlier
-schemas are read as today's (`migrations`).
+schemas are read as today's (`migrations`). Files are compared with their checksums before they are used: a stage's own
+when it loads them, an input's when it is named.
 """
 
 import hashlib
@@ -19,16 +21,39 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from fnmatch import fnmatch
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from illuminerf.workflow.atomic import read_json, remove_partial_files, write_bytes, write_json
+from illuminerf.workflow.atomic import (
+    JOURNAL,
+    PARTIAL,
+    explained_errors,
+    read_json,
+    recorded_writes,
+    remove_partial_files,
+    write_bytes,
+    write_json,
+)
+from illuminerf.workflow.checksums import (
+    OWN_FILES,
+    file_digest,
+    first_damaged,
+    folder_digest,
+    is_artefact,
+    seal_digest,
+    sealed_digest,
+    verify,
+    verify_once,
+    written_digests,
+)
 from illuminerf.workflow.config import first_difference, to_json
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.migrations import SCHEMA, upgraded
+from illuminerf.workflow.progress import say
 
-_OWN_FILES = ("config.json", "inputs.json", "provenance.json", "DONE", ".lock")
+__all__ = ["Artefact", "InUse", "fingerprint", "locked", "open_artefact", "provenance", "read_metrics", "verify"]
 _VERSIONED = ("illuminerf", "torch", "numpy", "mitsuba", "diffusers", "numba", "trimesh")
 
 
@@ -71,24 +96,25 @@ def open_artefact(
     """
     out = Path(out)
     key = {"schema": SCHEMA, "stage": stage, "config": to_json(config)}
-    made_from = {role: fingerprint(source) for role, source in sorted(inputs.items())}
-    is_done = _check_key(out, key, made_from)
-    if is_done:
-        yield Artefact(out, stage, is_done=True, finished=True)
-        return
-    with locked(out, is_shared) as lock:
-        if not is_shared:  # else they may be another process's, just being written
-            remove_partial_files(out)
-        write_json(out / "config.json", key)
-        write_json(out / "inputs.json", made_from)
-        artefact = Artefact(out, stage, is_done=False)
-        start = time.monotonic()
-        yield artefact
-        if artefact.finished and is_shared:
-            _wait_for_others(lock)
-            remove_partial_files(out)
-        if artefact.finished and not (out / "DONE").exists():
-            _seal(artefact, seconds=time.monotonic() - start)
+    with explained_errors(out):
+        made_from = {role: fingerprint(source) for role, source in sorted(inputs.items())}
+        if _check_key(out, key, made_from):
+            yield Artefact(out, stage, is_done=True, finished=True)
+            return
+        with locked(out, is_shared) as lock, recorded_writes(out):
+            if not is_shared:  # else they may be another process's, just being written
+                remove_partial_files(out)
+            remove_damaged(out, is_shared)
+            write_json(out / "config.json", key)
+            write_json(out / "inputs.json", made_from)
+            artefact = Artefact(out, stage, is_done=False)
+            start = time.monotonic()
+            yield artefact
+            if artefact.finished and is_shared:
+                _wait_for_others(lock)
+                remove_partial_files(out)
+            if artefact.finished and not (out / "DONE").exists():
+                _seal(artefact, seconds=time.monotonic() - start)
 
 
 def fingerprint(source: Path | str) -> str:
@@ -99,32 +125,37 @@ def fingerprint(source: Path | str) -> str:
     """
     if isinstance(source, str):
         return hashlib.sha256(source.encode()).hexdigest()
-    if (source / "config.json").exists() and (source / "inputs.json").exists():
+    if source.is_dir() and is_artefact(source):
         if not (source / "DONE").exists():
             raise UserError(
                 f"{source} is unfinished",
                 fix="run the stage that makes it again; it goes on where it stopped",
             )
-        return (source / "DONE").read_text().strip()
+        verify_once(source)
+        return sealed_digest(source)
     if source.is_dir():
-        return _folder_digest(source, exclude=())
+        return folder_digest(source)
     if source.is_file():
-        return _file_digest(source)
+        return file_digest(source)
     raise UserError(f"{source} does not exist", fix="check the path")
 
 
-def verify(out: Path) -> None:
-    """Recompute an artefact's fingerprint from its files.
+def remove_damaged(out: Path, is_shared: bool = False) -> None:
+    """Begin an unfinished folder again where a file in it is not as it was written: what depends on what, only its
+    stage knows.
 
     Raises:
-        UserError: a file was changed, truncated or removed since the stage finished.
+        UserError: there is such a file, and other processes work on the folder.
     """
-    recorded = fingerprint(out)
-    if _artefact_digest(out) != recorded:
-        raise UserError(
-            f"{out} is corrupt: its files are not those its stage wrote",
-            fix=f"delete {out} and run the same command again",
-        )
+    damaged = first_damaged(out)
+    if damaged is None:
+        return
+    if is_shared:
+        raise UserError(f"{damaged} is damaged", fix=f"stop all processes that work on {out}, delete it and run again")
+    say(f"{damaged} is damaged: {out} is made again from the start")
+    for name in written_digests(out).keys() - {"config.json", "inputs.json"}:
+        (out / name).unlink(missing_ok=True)
+    (out / JOURNAL).unlink()
 
 
 def _check_key(out: Path, key: dict[str, Any], made_from: dict[str, str]) -> bool:
@@ -132,7 +163,7 @@ def _check_key(out: Path, key: dict[str, Any], made_from: dict[str, str]) -> boo
         raise UserError(f"{out} is a file", wanted="a folder", fix="choose another --out")
     config_file, inputs_file = out / "config.json", out / "inputs.json"
     if not config_file.exists():
-        strangers = [entry.name for entry in out.iterdir() if entry.name not in _OWN_FILES] if out.exists() else []
+        strangers = [entry.name for entry in out.iterdir() if is_stranger(entry.name)] if out.exists() else []
         if strangers:
             raise UserError(
                 f"{out} holds files that are not a run of this program",
@@ -144,8 +175,13 @@ def _check_key(out: Path, key: dict[str, Any], made_from: dict[str, str]) -> boo
     refuse_other_key(str(out), upgraded(read_json(config_file), str(out)), key, old_inputs, made_from)
     if not (out / "DONE").exists():
         return False
-    verify(out)
+    verify_once(out)
     return True
+
+
+def is_stranger(name: str) -> bool:
+    """Whether no stage writes a file of this name first of all; what a kill left half written is none."""
+    return name not in OWN_FILES and not fnmatch(name, PARTIAL)
 
 
 def refuse_other_key(
@@ -164,8 +200,10 @@ def refuse_other_key(
 
 
 def _seal(artefact: Artefact, seconds: float) -> None:
-    write_json(artefact.path / "provenance.json", provenance(seconds, artefact.metrics))
-    write_bytes(artefact.path / "DONE", (_artefact_digest(artefact.path) + "\n").encode())
+    out = artefact.path
+    write_json(out / "provenance.json", provenance(seconds, artefact.metrics))
+    write_bytes(out / "DONE", (seal_digest(out) + "\n").encode())
+    (out / JOURNAL).unlink(missing_ok=True)
 
 
 def provenance(seconds: float, metrics: dict[str, Any]) -> dict[str, Any]:
@@ -195,25 +233,6 @@ def peak_memory_gb() -> float:
     """Largest resident size of this process so far, in GB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1e9 if sys.platform == "darwin" else 1e6)
-
-
-def _artefact_digest(out: Path) -> str:
-    # provenance differs between two runs that made the same thing, so it stays out of the fingerprint
-    return _folder_digest(out, exclude=("provenance.json", "DONE", ".lock"))
-
-
-def _folder_digest(folder: Path, exclude: tuple[str, ...]) -> str:
-    digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if path.is_file() and name not in exclude:
-            digest.update(f"{name}\0{_file_digest(path)}\n".encode())
-    return digest.hexdigest()
-
-
-def _file_digest(path: Path) -> str:
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 @contextmanager

@@ -29,10 +29,13 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> tuple[dic
         with safe_open(str(path), framework="pt", device=str(device)) as stream:
             tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
             header = stream.metadata() or {}
-        return tensors, json.loads(header.get("illuminerf", "{}"))
+        metadata = json.loads(header.get("illuminerf", "{}"))
+        if not isinstance(metadata, dict):
+            raise ValueError(f"a header that is {type(metadata).__name__}")
+        return tensors, metadata
     except FileNotFoundError as error:
         raise UserError(f"{path} is missing", fix="run the stage that makes it again") from error
-    except (SafetensorError, ValueError, OSError) as error:
+    except (SafetensorError, ValueError, LookupError, TypeError, RuntimeError, RecursionError, OSError) as error:
         raise UserError(f"{path} is corrupt", got=str(error), fix="delete its folder and run again") from error
 
 

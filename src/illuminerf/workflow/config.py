@@ -10,6 +10,7 @@ from typing import Any, TypeVar, Union
 from illuminerf.workflow.errors import UserError
 
 ConfigType = TypeVar("ConfigType")
+_LARGEST_FLOAT = 10**308
 
 
 def to_json(config: Any) -> Any:
@@ -25,7 +26,7 @@ def to_json(config: Any) -> Any:
     return config
 
 
-def from_json(cls: type[ConfigType], content: dict[str, Any]) -> ConfigType:
+def from_json(cls: type[ConfigType], content: Any) -> ConfigType:
     """Build the dataclass `cls` from what `to_json` made of it.
 
     Raises:
@@ -42,7 +43,11 @@ def from_json(cls: type[ConfigType], content: dict[str, Any]) -> ConfigType:
         has_default = not (field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING)
         if name not in content and not has_default:
             raise UserError(f"{cls.__name__} lacks the field '{name}'")
-    return cls(**{name: coerced(f"{cls.__name__}.{name}", hints[name], value) for name, value in content.items()})
+    values = {name: coerced(f"{cls.__name__}.{name}", hints[name], value) for name, value in content.items()}
+    try:
+        return cls(**values)
+    except (ValueError, TypeError, ArithmeticError) as error:
+        raise UserError(f"{cls.__name__} cannot be as it is written", got=str(error)) from error
 
 
 def coerced(name: str, hint: Any, value: Any) -> Any:
@@ -76,7 +81,7 @@ def coerced(name: str, hint: Any, value: Any) -> Any:
         return value
     if hint is Path:
         return Path(value)
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+    if hint is float and isinstance(value, int) and not isinstance(value, bool) and abs(value) < _LARGEST_FLOAT:
         return float(value)
     if hint in (int, float, str, bool) and type(value) is not hint:
         raise UserError(f"{name} has the wrong type", got=type(value).__name__, wanted=hint.__name__)

@@ -20,13 +20,20 @@ class MetricsLog:
         self.path = folder / "metrics.jsonl"
         self.board = _board(folder / "tensorboard", first_step) if tensorboard else None
         kept = [line for line in _records(self.path) if line["step"] <= first_step]
-        write_bytes(self.path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in kept).encode())
+        lines = [json.dumps(line, sort_keys=True) + "\n" for line in kept]
+        self._last = lines[-1] if lines else ""
+        write_bytes(self.path, "".join(lines).encode(), grows=True)
 
     def write(self, kind: str, step: int, values: dict[str, float], **only_for_board: float) -> None:
-        """Record numbers after `step` finished steps; `only_for_board` is for what differs from run to run."""
-        record = {"kind": kind, "step": step, **values}
-        with open(self.path, "a", encoding="utf-8") as stream:
-            stream.write(json.dumps(record, sort_keys=True) + "\n")
+        """Record numbers after `step` finished steps; `only_for_board` is for what differs from run to run.
+
+        A record like the last one is not repeated: a run that was stopped after its last step measures once more.
+        """
+        line = json.dumps({"kind": kind, "step": step, **values}, sort_keys=True) + "\n"
+        if line != self._last:
+            with open(self.path, "a", encoding="utf-8") as stream:
+                stream.write(line)
+            self._last = line
         if self.board is not None:
             for name, value in (values | only_for_board).items():
                 self.board.add_scalar(f"{kind}/{name}", value, step)
@@ -57,9 +64,11 @@ def _board(folder: Path, first_step: int) -> Any:
 def _records(path: Path) -> list[dict[str, Any]]:
     """Whole lines only: the last one may have been cut off."""
     records = []
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []:
         try:
-            records.append(json.loads(line))
+            record = json.loads(line)
         except ValueError:
             continue
+        if isinstance(record, dict) and isinstance(record.get("step"), int):
+            records.append(record)
     return records

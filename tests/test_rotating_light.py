@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import trimesh
 
+from illuminerf import rotating_light
 from illuminerf.cues.renderer import CUE_CHANNELS, CueSampling, render_cues
-from illuminerf.data.capture import write_capture
+from illuminerf.data.capture import load_capture, write_capture
 from illuminerf.diffusion.relighting_model import save_model
+from illuminerf.rotating_light import Config
 from illuminerf.scene.cameras import Cameras, look_at
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import read_exr, read_png
 from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.scene.video import read_video, video_size
-from illuminerf.stages import rotate_light
-from illuminerf.stages.rotate_light import Config
 from illuminerf.workflow.errors import UserError
 from tests.diffusion.tiny import tiny_model, with_noise_in_every_weight
 
@@ -53,7 +53,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path, 
 
 @pytest.fixture(scope="module")
 def turned(inputs: tuple[Path, Path, Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return rotate_light.run(*inputs, None, CONFIG, tmp_path_factory.mktemp("turned") / "out")
+    return rotating_light.render(*inputs, None, CONFIG, tmp_path_factory.mktemp("turned") / "out")
 
 
 def frames(out: Path) -> list[bytes]:
@@ -63,7 +63,7 @@ def frames(out: Path) -> list[bytes]:
 def test_cues_are_those_of_the_turned_light(inputs: tuple[Path, Path, Path, Path], turned: Path) -> None:
     geometry, capture, light, _ = inputs
     mesh, placed = TriangleMesh.load_glb(geometry / "mesh.glb"), EnvironmentMap.load(light)
-    cameras = rotate_light.load_capture(capture).views.cameras
+    cameras = load_capture(capture).views.cameras
     found = np.stack(list(read_exr(turned / "cues" / "001.exr")[name] for name in CUE_CHANNELS))
     for turn, is_same in ((math.pi / 2, True), (-math.pi / 2, False)):
         (expected,) = render_cues(mesh, cameras, placed.rotated(turn), CONFIG.sampling, 0, [1])
@@ -87,17 +87,17 @@ def test_interrupted_and_resumed_equals_uninterrupted(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(rotate_light, "write_mp4", fails)
+        patched.setattr(rotating_light, "write_mp4", fails)
         with pytest.raises(KeyboardInterrupt):
-            rotate_light.run(*inputs, None, CONFIG, tmp_path / "out")
+            rotating_light.render(*inputs, None, CONFIG, tmp_path / "out")
     (tmp_path / "out" / "images" / "002.png").unlink()
-    rotate_light.run(*inputs, None, CONFIG, tmp_path / "out")
+    rotating_light.render(*inputs, None, CONFIG, tmp_path / "out")
     assert frames(tmp_path / "out") == frames(turned)
     assert (tmp_path / "out" / "DONE").read_text() == (turned / "DONE").read_text()
 
 
 def test_mistakes_are_told(inputs: tuple[Path, Path, Path, Path], tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no view 2.*0 to 1"):
-        rotate_light.run(*inputs, None, replace(CONFIG, view=2), tmp_path / "out")
+        rotating_light.render(*inputs, None, replace(CONFIG, view=2), tmp_path / "out")
     with pytest.raises(UserError, match="at least 1"):
         Config(num_frames=0)

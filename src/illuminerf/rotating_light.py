@@ -22,6 +22,7 @@ from illuminerf.diffusion.full_size import Photograph, relight_photographs
 from illuminerf.diffusion.pretrained import model_folder, pretrained_model
 from illuminerf.diffusion.relighter import Relighter
 from illuminerf.evaluation.benchmark_rule import on_white
+from illuminerf.run_folder import RunFolder
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.environment import EnvironmentMap, chrome_ball
 from illuminerf.scene.images import linear_from_srgb, read_png, srgb_from_linear, write_exr, write_png
@@ -75,7 +76,29 @@ class Config:
             raise UserError("counts must be at least 1 and the view not negative", got=str(self))
 
 
-def run(
+def film(run: RunFolder, out: Path, light: str | None, model: str, config: Config) -> Path:
+    """A film of one photograph of a finished run under one of its lights, which makes one turn.
+
+    Args:
+        run: the run.
+        out: folder of the frames and the film.
+        light: one of the run's lights; None where it has only one.
+        model: the relighting model: a folder, embedded or dilightnet.
+        config: which photograph, how many frames.
+
+    Returns:
+        The MP4.
+
+    Raises:
+        UserError: no such run, light or photograph, or `out` was made with other settings.
+    """
+    used = run.light(light).folder / "cues" / "light.exr"
+    illumination = run.folder / "illumination"
+    given = illumination if illumination.is_dir() else None
+    return render(run.folder / "geometry", run.capture, used, model, given, config, out) / "rotating.mp4"
+
+
+def render(
     geometry: Path, capture: Path, light: Path, model: Path | str, illumination: Path | None, config: Config, out: Path
 ) -> Path:
     """Relight one photograph of `capture` under all turns of `light`; frames that exist are kept.
