@@ -40,7 +40,9 @@ def contents(place: str | Path, jobs: tuple[str, ...]) -> dict[str, bytes]:
     """Everything in the jobs' folders that must not depend on where and how often they ran."""
     storage = Storage(place)
     names = [f"{job}/{name}" for job in jobs for name in storage.tree(job)]
-    return {name: storage.read(name) for name in names if not name.endswith(("provenance.json", ".lock"))}
+    return {
+        name: storage.read(name) for name in names if not name.endswith(("provenance.json", "checksums.json", ".lock"))
+    }
 
 
 def cells(out: Path) -> dict[tuple[str, str, str], dict[str, Any]]:
