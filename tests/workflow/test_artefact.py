@@ -82,6 +82,19 @@ def test_strangers_files_are_not_touched(tmp_path: Path) -> None:
         make(tmp_path / "thesis.tex")
 
 
+def test_what_file_managers_leave_behind_does_no_harm(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / ".DS_Store").write_text("opened before")
+    make(tmp_path / "a")
+    (tmp_path / "a" / ".DS_Store").write_text("and after")
+    (tmp_path / "a" / "Thumbs.db").write_text("on Windows")
+    assert make(tmp_path / "a")
+    verify(tmp_path / "a")
+    (tmp_path / "a" / "thumbs.txt").write_text("but this was put there")
+    with pytest.raises(UserError, match="corrupt: thumbs.txt"):
+        verify(tmp_path / "a")
+
+
 def test_two_processes_cannot_share_a_folder(tmp_path: Path) -> None:
     with (
         open_artefact(tmp_path / "a", "toy", Config(), {}),

@@ -42,6 +42,7 @@ from illuminerf.workflow.checksums import (
     first_damaged,
     folder_digest,
     is_artefact,
+    is_litter,
     seal_digest,
     sealed_digest,
     verify,
@@ -181,7 +182,7 @@ def _check_key(out: Path, key: dict[str, Any], made_from: dict[str, str]) -> boo
 
 def is_stranger(name: str) -> bool:
     """Whether no stage writes a file of this name first of all; what a kill left half written is none."""
-    return name not in OWN_FILES and not fnmatch(name, PARTIAL)
+    return name not in OWN_FILES and not is_litter(name) and not fnmatch(name, PARTIAL)
 
 
 def refuse_other_key(

@@ -5,6 +5,7 @@ versions have DONE alone; they are compared too, without telling which file diff
 """
 
 import hashlib
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from illuminerf.workflow.atomic import JOURNAL, read_json, write_json
@@ -12,9 +13,10 @@ from illuminerf.workflow.errors import UserError
 
 CHECKSUMS = "checksums.json"
 _DIGEST_LENGTH = 64
-OWN_FILES = ("config.json", "inputs.json", "provenance.json", CHECKSUMS, "DONE", ".lock", JOURNAL)
+OWN_FILES = ("config.json", "inputs.json", "provenance.json", CHECKSUMS, "DONE")
 # provenance differs between two runs that made the same thing, so it stays out of the fingerprint
-_NOT_CONTENT = ("provenance.json", CHECKSUMS, "DONE", ".lock", JOURNAL)
+_NOT_CONTENT = ("provenance.json", CHECKSUMS, "DONE")
+_LITTER = ("Thumbs.db", "desktop.ini")
 _States = tuple[tuple[str, int, int, int], ...]
 _compared: dict[Path, _States] = {}
 
@@ -28,6 +30,11 @@ def file_digest(path: Path) -> str:
 def folder_digest(folder: Path) -> str:
     """One sha256 for all files of a folder that is no artefact."""
     return _combined(_file_digests(folder))
+
+
+def is_litter(name: str) -> bool:
+    """Whether a file of that name is none of a folder's content: hidden, or a file manager's."""
+    return name.startswith(".") or name in _LITTER
 
 
 def is_artefact(folder: Path) -> bool:
@@ -100,14 +107,19 @@ def verify_once(out: Path) -> None:
 
 
 def _state(out: Path) -> _States:
-    # the two that another process may just be removing tell nothing
-    paths = (path for path in sorted(out.rglob("*")) if path.name not in (".lock", JOURNAL) and path.is_file())
-    found = ((path.as_posix(), path.stat()) for path in paths)
+    found = ((path.as_posix(), path.stat()) for path in _contents(out))
     return tuple((name, stat.st_size, stat.st_mtime_ns, stat.st_ino) for name, stat in found)
 
 
+def _contents(folder: Path) -> Iterator[Path]:
+    """Its files in order, without hidden ones (.lock, .written, .DS_Store) and other litter."""
+    for path in sorted(folder.rglob("*")):
+        if not is_litter(path.name) and path.is_file():
+            yield path
+
+
 def _file_digests(folder: Path, exclude: tuple[str, ...] = ()) -> dict[str, str]:
-    named = ((path.relative_to(folder).as_posix(), path) for path in sorted(folder.rglob("*")) if path.is_file())
+    named = ((path.relative_to(folder).as_posix(), path) for path in _contents(folder))
     return {name: file_digest(path) for name, path in named if name not in exclude}
 
 
