@@ -3,6 +3,7 @@
 SUMMARIES = {
     "relight": "every stage of the method, from photographs to turntable, mesh and report",
     "render": "a finished run along a camera path or a turntable: PNG, EXR, MP4, GIF",
+    "rotate-light": "film one photograph of a finished run while the light turns about it",
     "demo": "relight the capture that ships with the package and score the result",
     "batch": "many captures under many lights, here or on a cluster",
     "presets": "what each preset is for and what it costs",
