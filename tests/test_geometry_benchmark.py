@@ -75,7 +75,9 @@ def test_every_object_is_scored_and_broken_ones_are_left_out(finished: Path) -> 
 def scored(finished: Path, mesh: TriangleMesh, folder: Path) -> dict[str, float]:
     """Scores with another mesh, in the unit ball, in place of the estimated one."""
     ball = finished / "ball"
-    shutil.copytree(ball / "geometry", folder / "geometry", ignore=shutil.ignore_patterns("config.json", "inputs.json", "DONE"))
+    shutil.copytree(
+        ball / "geometry", folder / "geometry", ignore=shutil.ignore_patterns("config.json", "inputs.json", "DONE")
+    )
     mesh.save_glb(folder / "geometry" / "mesh.glb")
     inputs = (ball / "source", ball / "capture", folder / "geometry", ball / "test_views")
     return read_json(score_geometry.run(*inputs, SCORES, folder / "scores") / "scores.json")

@@ -37,6 +37,10 @@ th[aria-sort=descending] button::after { content: " \\2193" }
 .strip img { display: block; width: 100%; height: auto } .strip figure + figure { margin-top: .5rem }
 figcaption { overflow-wrap: anywhere } .scale { max-width: 24rem } .scale img { width: 100%; height: 1rem }
 .scale div { display: flex; justify-content: space-between; font-size: .8rem }
+@media (max-width: 40rem) {
+  table { font-size: .8rem } td, th { padding-right: .5rem } th { white-space: normal } th button::after { content: "" }
+  td.text { white-space: normal; min-width: 5rem } td.note { min-width: 9rem }
+}
 """
 )
 _SCRIPT = """

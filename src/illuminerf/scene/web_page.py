@@ -18,7 +18,8 @@ body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto
 h1 { margin-bottom: 0 } h2 { margin-top: 2.2rem; border-bottom: 1px solid var(--line) } p.note { opacity: .75 }
 .row { display: flex; flex-wrap: wrap; gap: .6rem; align-items: flex-end } figure { margin: 0 }
 figcaption { font-size: .8rem; opacity: .75; text-align: center } img, video { border-radius: 6px; max-width: 100% }
-img { image-rendering: auto; height: 9.5rem } img.wide { height: 7rem } video { height: 18rem; background: #fff }
+img { image-rendering: auto; height: 9.5rem } img.wide { height: 7rem } img.tall { height: 28rem }
+video { height: 18rem; background: #fff }
 table { border-collapse: collapse } td, th { padding: .25rem .9rem .25rem 0; text-align: right }
 td:first-child, th:first-child { text-align: left } th { border-bottom: 1px solid var(--line) }
 """
@@ -42,12 +43,17 @@ def evenly_spread(items: Sequence[_Item], count: int) -> list[_Item]:
 def picture_row(pictures: list[tuple[np.ndarray, str]]) -> str:
     """(float [height, width, 3 or 4] in [0, 1], caption) side by side."""
     figures = "".join(
-        f"<figure><img {'class=wide' if image.shape[1] > 1.6 * image.shape[0] else ''} "
+        f"<figure><img {_shape_class(image)} "
         f"src='{png_url(thumbnail(image, 640))}' "
         f"alt='{html.escape(title)}'><figcaption>{html.escape(title)}</figcaption></figure>"
         for image, title in pictures
     )
     return f"<div class=row>{figures}</div>"
+
+
+def _shape_class(image: np.ndarray) -> str:
+    height, width = image.shape[:2]
+    return "class=wide" if width > 1.6 * height else "class=tall" if height > 1.6 * width else ""
 
 
 def thumbnail(image: np.ndarray, longest_side: int) -> Image.Image:
