@@ -63,6 +63,7 @@ ABLATIONS: dict[str, Ablation] = {
     "shared_normal_features": _shared_normal_features,
     "no_normal_smoothness": _with_losses(normal_smoothness=0.0),
     "sphere_start": _with_losses(starts_from_hull=False),
+    "black_background": _with_losses(random_background=False),
 }
 """What each changes of a geometry's settings: one thing."""
 

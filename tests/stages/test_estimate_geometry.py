@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from illuminerf.data.capture import load_capture
+from illuminerf.data.capture import load_capture, save_capture
 from illuminerf.fields import optimisation
 from illuminerf.fields.geometry_fit import GeometryLossConfig
 from illuminerf.fields.image_rendering import observed_cells
+from illuminerf.fields.meshing import EmptySurface
 from illuminerf.fields.optimisation import OptimiserConfig
 from illuminerf.fields.storage import load_field
 from illuminerf.scene.meshes import TriangleMesh
+from illuminerf.scene.views import Views
 from illuminerf.stages import estimate_geometry
 from illuminerf.workflow.artefact import read_metrics
 from illuminerf.workflow.config import from_json, to_json
@@ -90,6 +92,24 @@ def test_another_seed_is_another_field(geometry: Path, sphere_capture: Path, tmp
         out = estimate_geometry.run(sphere_capture, config, tmp_path / str(seed))
         fields.append((out / "field.safetensors").read_bytes())
     assert fields[0] != fields[1]
+
+
+def test_a_random_background_shows_the_outline_of_a_black_object(sphere_capture: Path, tmp_path: Path) -> None:
+    """Over black its colours say nothing of where it ends; here there is no mask loss to say it either."""
+    capture = load_capture(sphere_capture)
+    views = capture.views
+    alpha = np.stack(list(views.alphas()))
+    black = Views(views.cameras, np.zeros((*alpha.shape, 3), np.float32), alpha)
+    save_capture(tmp_path / "black", replace(capture, views=black))
+    surface = replace(CONFIG.radiance_field.surface, initial_radius=0.4)
+    losses = replace(CONFIG.losses, mask=0.0, starts_from_hull=False)
+    config = replace(CONFIG, losses=losses, radiance_field=replace(CONFIG.radiance_field, surface=surface))
+    out = estimate_geometry.run(tmp_path / "black", config, tmp_path / "out")
+    radius = np.linalg.norm(TriangleMesh.load_glb(out / "mesh.glb").vertices, axis=-1)
+    assert abs(float(np.median(radius)) - 0.6) < 0.05
+    over_black = replace(config, losses=replace(losses, random_background=False))
+    with pytest.raises(EmptySurface, match="is empty"):
+        estimate_geometry.run(tmp_path / "black", over_black, tmp_path / "over_black")
 
 
 def test_stored_field_has_tight_cells(geometry: Path) -> None:

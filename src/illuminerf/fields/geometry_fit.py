@@ -33,6 +33,9 @@ class GeometryLossConfig:
     """lambda_1, lambda_2, lambda_3 of the asymmetric loss (supplement A.1)."""
     normal_smoothness: float = 0.1
     """lambda_4 (supplement A.1)."""
+    random_background: bool = True
+    """Where there are masks, each ray and its pixel are laid over one colour, drawn anew at every step. False: over
+    black, for comparison."""
     smoothness_sigma: float = 0.01
     """Standard deviation of the perturbed positions (supplement A.1)."""
     first_levels: int = 4
@@ -82,9 +85,15 @@ def geometry_loss(
     anywhere = draws.uniform(3) * 1.6 - 0.8
     gradients = torch.cat([samples.end_gradients.view(-1, 3), field.surface(anywhere, levels).gradient])
 
+    wanted = target_srgb[index]
+    if target_alpha is not None and config.random_background:
+        # Deviation: over black a haze about a dark object costs no colour loss, and outlines stay soft
+        behind = draws.uniform(3)
+        srgb = srgb + torch.exp(-samples.depth)[:, None] * behind
+        wanted = wanted + (1 - target_alpha[index])[:, None] * behind
     # Charbonnier as in camp_zipnerf: against the squared error's ever smaller gradient the smoothness terms win
-    squared = losses.colour_loss(srgb.detach(), target_srgb[index])
-    total = losses.robust_colour_loss(srgb, target_srgb[index]) + config.eikonal * losses.eikonal_loss(gradients)
+    squared = losses.colour_loss(srgb.detach(), wanted)
+    total = losses.robust_colour_loss(srgb, wanted) + config.eikonal * losses.eikonal_loss(gradients)
     total = total + interlevel_loss(samples.edges, samples.weights, samples.proposal_edges, samples.proposal_weights)
     rays = len(index)
     total = total + config.orientation * losses.orientation_loss(

@@ -41,6 +41,8 @@ def extract_mesh(
     side = cells.cells.shape[0]
     device = cells.cells.device
     occupied = cells.cells.nonzero()
+    if not len(occupied):
+        raise _empty()
     low = (occupied.min(0).values - 1).cpu().numpy() * (2 / side) - 1
     high = (occupied.max(0).values + 2).cpu().numpy() * (2 / side) - 1
     spacing = float((high - low).max()) / (resolution - 1)
@@ -54,10 +56,7 @@ def extract_mesh(
         distance[chunk[inside]] = surface.signed_distance(positions[inside])
     volume = distance.view(shape).cpu().numpy()
     if volume.min() >= 0 or volume.max() <= 0:
-        raise EmptySurface(
-            "the fitted surface is empty: its signed distance has no zero crossing",
-            fix="check masks and cameras, or fit for more steps",
-        )
+        raise _empty()
     # inside is below outside, and faces come out counter-clockwise seen from outside (held by a test)
     vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
     vertices = vertices + low
@@ -69,6 +68,13 @@ def extract_mesh(
     positions = torch.from_numpy(vertices.astype(np.float32)).to(device)
     normals = torch.cat([surface.predicted_normals(chunk) for chunk in positions.split(_CHUNK)])
     return TriangleMesh(positions.cpu().numpy(), faces.astype(np.int32), normals.cpu().numpy())
+
+
+def _empty() -> EmptySurface:
+    return EmptySurface(
+        "the fitted surface is empty: its signed distance has no zero crossing",
+        fix="check masks and cameras, or fit for more steps",
+    )
 
 
 def _large_components(

@@ -12,7 +12,7 @@ from typing import Any
 
 from illuminerf.workflow.errors import UserError
 
-SCHEMA = 2
+SCHEMA = 3
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,10 @@ class NewField:
     """What reproduces the stage without it, as JSON."""
 
 
-_NEW_FIELDS = (NewField(2, "render_radiance_cues", "shard", ""),)
+_NEW_FIELDS = (
+    NewField(2, "render_radiance_cues", "shard", ""),
+    NewField(3, "estimate_geometry", "losses.random_background", False),
+)
 
 
 def upgraded(key: Any, where: str, fields: tuple[NewField, ...] = _NEW_FIELDS, schema: int = SCHEMA) -> Any:
