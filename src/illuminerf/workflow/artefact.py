@@ -21,14 +21,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from fnmatch import fnmatch
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from illuminerf.workflow.atomic import (
     JOURNAL,
-    PARTIAL,
     explained_errors,
     read_json,
     recorded_writes,
@@ -182,7 +180,7 @@ def _check_key(out: Path, key: dict[str, Any], made_from: dict[str, str]) -> boo
 
 def is_stranger(name: str) -> bool:
     """Whether no stage writes a file of this name first of all; what a kill left half written is none."""
-    return name not in OWN_FILES and not is_litter(name) and not fnmatch(name, PARTIAL)
+    return name not in OWN_FILES and not is_litter(name)
 
 
 def refuse_other_key(
