@@ -38,6 +38,11 @@ def tiny(samples: int = 1) -> Preset:
     return dataclasses.replace(
         preset,
         geometry=dataclasses.replace(preset.geometry, optimiser=steps, mesh_resolution=40, num_previews=1),
+        illumination=dataclasses.replace(
+            preset.illumination,
+            gathering=dataclasses.replace(preset.illumination.gathering, num_points=500),
+            fit=dataclasses.replace(preset.illumination.fit, map_height=8),
+        ),
         cues=dataclasses.replace(
             preset.cues, sampling=dataclasses.replace(preset.cues.sampling, samples_per_pixel=4), max_light_height=16
         ),

@@ -106,6 +106,7 @@ def tiny_preset(device: str) -> Preset:
     return change(
         preset,
         geometry=change(preset.geometry, optimiser=steps, mesh_resolution=32, num_previews=1),
+        illumination=change(preset.illumination, gathering=change(preset.illumination.gathering, num_points=500)),
         cues=change(
             preset.cues, sampling=change(preset.cues.sampling, samples_per_pixel=2, device="cpu"), max_light_height=16
         ),

@@ -21,6 +21,7 @@ from pathlib import Path
 import torch
 from safetensors import safe_open
 
+from illuminerf.diffusion.training_config import MonitoringConfig
 from illuminerf.stages import train_relighting_model
 from illuminerf.stages.train_relighting_model import Config, Phase
 from illuminerf.workflow.artefact import read_metrics
@@ -40,7 +41,9 @@ def configured(options: argparse.Namespace) -> Config:
     """The stage's own defaults, with every phase stretched by `--scale`."""
     config = Config(device=options.device, checkpoint_seconds=options.checkpoint_seconds)
     if options.tiny:
-        return dataclasses.replace(config, phases=(Phase(2, 16, "products"), Phase(1, 16)), batch_size=2)
+        monitoring = MonitoringConfig(validation_pairs=1, final_pairs=1)
+        phases = (Phase(2, 16, "products"), Phase(1, 16))
+        return dataclasses.replace(config, phases=phases, batch_size=2, monitoring=monitoring)
     phases = tuple(
         dataclasses.replace(phase, num_steps=max(1, round(phase.num_steps * options.scale))) for phase in config.phases
     )
