@@ -1,5 +1,6 @@
 """Inputs that are almost right: bytes, JSON and containers of both, changed at random by a seed."""
 
+import contextlib
 import copy
 import json
 import random
@@ -50,12 +51,14 @@ def mutated_bytes(content: bytes, draw: random.Random, other: bytes = b"") -> by
 
 def mutated_json(text: bytes, draw: random.Random, other: bytes = b"") -> bytes:
     """JSON with a few values replaced, dropped, doubled or exchanged; now and then just broken text."""
-    if draw.random() < 0.1:
-        return mutated_bytes(text, draw, other)
-    try:
-        whole: Any = [json.loads(text)]
-    except (ValueError, RecursionError):
-        return mutated_bytes(text, draw, other)
+    if draw.random() >= 0.1:
+        with contextlib.suppress(ValueError, RecursionError):  # some of what is spoilt again is JSON no longer
+            return _changed_json(text, draw)
+    return mutated_bytes(text, draw, other)
+
+
+def _changed_json(text: bytes, draw: random.Random) -> bytes:
+    whole: Any = [json.loads(text)]
     for _ in range(1 + min(int(draw.expovariate(0.8)), 6)):
         parent, key = _place(whole, draw)
         if isinstance(parent[key], (int, float)) and abs(parent[key]) < 1e300 and draw.random() < 0.4:
@@ -100,6 +103,8 @@ def mutated_png(content: bytes, draw: random.Random, other: bytes = b"") -> byte
         (length,) = struct.unpack(">I", content[position : position + 4])
         chunks.append([content[position + 4 : position + 8], content[position + 8 : position + 8 + length]])
         position += 12 + length
+    if not chunks:
+        return mutated_bytes(content, draw, other)
     for _ in range(draw.randint(1, 2)):
         chosen = draw.choice(chunks)
         if chosen[0] == b"IDAT" and draw.random() < 0.5:

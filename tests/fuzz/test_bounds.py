@@ -83,6 +83,7 @@ def header_bomb(path: Path) -> Path:
 
 def field_bomb(path: Path) -> Path:
     save_sphere(path, 0, None)
+    load_field(path)  # good to begin with; what torch imports at the first use is not the bomb's
     content = json.loads((path / "field.json").read_text())
     content["field"]["surface"]["hidden_width"] = 10**9
     (path / "field.json").write_text(json.dumps(content))
@@ -130,3 +131,17 @@ def test_a_promise_of_gigabytes_is_refused(name: str, tmp_path: Path) -> None:
         assert tracemalloc.get_traced_memory()[1] < _MEGABYTES * 2**20
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "part", [("surface", "hidden_width"), ("proposal", "hidden_width"), ("appearance", "bottleneck_width")]
+)
+@pytest.mark.parametrize("width", [-8, -(2**63), 2**62, 10**30])
+def test_impossible_widths_of_a_field_are_refused(part: tuple[str, str], width: int, tmp_path: Path) -> None:
+    save_sphere(tmp_path, 0, None)
+    assert load_field(tmp_path), "guard: it is good to begin with"
+    content = json.loads((tmp_path / "field.json").read_text())
+    content["field"][part[0]][part[1]] = width
+    (tmp_path / "field.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match="field.json"):
+        load_field(tmp_path)

@@ -2,9 +2,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from PIL import Image
 
 from illuminerf.scene.meshes import TriangleMesh, sphere_mesh
 from illuminerf.workflow.errors import UserError
+from tests.cues.made_objects import FACES, UV, Gltf, png
 
 
 def test_glb_round_trip_is_exact_and_stands_upright(tmp_path: Path) -> None:
@@ -15,8 +18,6 @@ def test_glb_round_trip_is_exact_and_stands_upright(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.vertices, stretched.vertices)
     np.testing.assert_array_equal(again.vertex_normals, stretched.vertex_normals)
     np.testing.assert_array_equal(again.faces, stretched.faces)
-    import trimesh
-
     raw = trimesh.load_scene(str(tmp_path / "mesh.glb"))
     assert raw.extents[1] == pytest.approx(6, rel=1e-2), "glTF is y-up: our z must be its y"
 
@@ -31,3 +32,20 @@ def test_broken_meshes_are_refused(tmp_path: Path) -> None:
     (tmp_path / "mesh.glb").write_bytes(b"glTF but not really")
     with pytest.raises(UserError, match="not a readable GLB"):
         TriangleMesh.load_glb(tmp_path / "mesh.glb")
+
+
+def test_pictures_on_a_mesh_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shape is all that is wanted: what a texture unpacks to must cost neither time nor memory."""
+    made = Gltf()
+    look = {"pbrMetallicRoughness": {"baseColorTexture": made.texture(png((9, 99, 200)))}}
+    made.mesh(material=look, TEXCOORD_0=UV)
+    made.json["scenes"] = [{"nodes": [0]}]
+    opened: list[object] = []
+    monkeypatch.setattr(Image, "open", lambda *given, **named: opened.append(given))
+    assert len(TriangleMesh.load(made.glb(tmp_path / "mesh.glb")).faces) == len(FACES)
+    assert not opened
+    with pytest.MonkeyPatch.context() as patch:  # guard: the library would
+        loads = trimesh.load_scene
+        patch.setattr(trimesh, "load_scene", lambda *given, **named: loads(*given, **named | {"skip_materials": False}))
+        TriangleMesh.load(tmp_path / "mesh.glb")
+    assert opened

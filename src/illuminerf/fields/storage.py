@@ -41,8 +41,16 @@ def _check_sizes(folder: Path, config: FieldConfig, tensors: dict[str, Tensor]) 
     """UserError where field.json is not of these tensors, before memory is spent by its word."""
     too_deep = max(grid.num_levels for grid in _grids(config)) > _MOST or config.appearance.num_hidden_layers > _MOST
     if not too_deep:
-        with torch.device("meta"):
-            wanted = {name: tensor.shape for name, tensor in RadianceField(config).state_dict().items()}
+        try:
+            with torch.device("meta"):
+                wanted = {name: tensor.shape for name, tensor in RadianceField(config).state_dict().items()}
+        except (RuntimeError, TypeError, ValueError, ArithmeticError) as error:  # widths below 0, or beyond 64 bits
+            reason = str(error).partition("\n")[0]
+            raise UserError(
+                f"{folder}/field.json is not that of a field",
+                got=reason,
+                fix="run the stage that makes the field again",
+            ) from error
         different = [name for name, shape in wanted.items() if name not in tensors or tensors[name].shape != shape]
     if too_deep or different:
         raise UserError(

@@ -87,7 +87,7 @@ def _loaded(path: Path, kind: str, file_from_world: np.ndarray) -> TriangleMesh:
         raise UserError(f"{path} is missing", wanted=f"a .{kind} mesh")
     check_claims(path, kind)
     try:
-        scene = trimesh.load_scene(str(path), file_type=kind, process=False)
+        scene = trimesh.load_scene(str(path), file_type=kind, process=False, skip_materials=True)
         placed = [_placed(scene, node, file_from_world) for node in scene.graph.nodes_geometry]
     except Exception as error:  # what broken files make of the library, no list foresees
         raise UserError(

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import types
 import typing
 from pathlib import Path
@@ -38,7 +39,7 @@ def from_json(cls: type[ConfigType], content: Any) -> ConfigType:
     unknown = sorted(set(content) - set(fields))
     if unknown:
         raise UserError(f"{cls.__name__} has no field '{unknown[0]}'", wanted=", ".join(fields))
-    hints = typing.get_type_hints(cls)
+    hints = _type_hints(cls)  # type: ignore[arg-type]
     for name, field in fields.items():
         has_default = not (field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING)
         if name not in content and not has_default:
@@ -48,6 +49,11 @@ def from_json(cls: type[ConfigType], content: Any) -> ConfigType:
         return cls(**values)
     except (ValueError, TypeError, ArithmeticError) as error:
         raise UserError(f"{cls.__name__} cannot be as it is written", got=str(error)) from error
+
+
+@functools.cache
+def _type_hints(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls)
 
 
 def coerced(name: str, hint: Any, value: Any) -> Any:
@@ -106,7 +112,7 @@ def changed(config: ConfigType, name: str, value: Any) -> ConfigType:
     if first not in (fields := [field.name for field in dataclasses.fields(config)]):  # type: ignore[arg-type]
         raise UserError(f"{type(config).__name__} has no field '{first}'", wanted=", ".join(fields))
     if not rest:
-        hint = typing.get_type_hints(type(config))[first]
+        hint = _type_hints(type(config))[first]  # type: ignore[arg-type]
         new = coerced(f"{type(config).__name__}.{first}", hint, value)
     elif dataclasses.is_dataclass(part := getattr(config, first)):
         new = changed(part, rest, value)
