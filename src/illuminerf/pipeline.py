@@ -191,7 +191,11 @@ def peak_memory_gb(run: Path) -> float:
 def _check(jobs: Sequence[LightJob]) -> None:
     """Find bad lights before hours are spent on the geometry."""
     if not jobs:
-        raise UserError("no light was given", fix="name at least one with --light")
+        raise UserError(
+            "no light was given",
+            wanted="a file, or a name of 'illuminerf lights list'",
+            fix="add one, such as --light evening",
+        )
     names = [job.name for job in jobs]
     if len(set(names)) < len(names):
         raise UserError("two lights have the same name", got=", ".join(names), fix="rename one of the files")

@@ -22,7 +22,7 @@ from illuminerf.data.capture_warnings import Quality, warnings_of
 from illuminerf.data.developing import develop, plan_sizes, planned_cameras
 from illuminerf.data.matching_images import Matched, small_photograph, write_matching_images
 from illuminerf.data.object_masks import Masked, MaskSource, settle_masks
-from illuminerf.data.photographs import photographs_of, read_shot
+from illuminerf.data.photographs import left_out, photographs_of, read_shot
 from illuminerf.data.placement import Ball, focus_ball, hull_ball, mask_preview
 from illuminerf.data.solved_cameras import Solved
 from illuminerf.data.source import SourceCapture, SourceFrame
@@ -90,6 +90,8 @@ def run(photographs: Path, config: Config, out: Path) -> Path:
             with open_artefact(out, "estimate_cameras", config, inputs):
                 return out
         frames = photographs_of(photographs, config.mask_folder, config.num_frames, work / "frames")
+        if refused := left_out(photographs):
+            say(f"left out, for they are not read: {len(refused)} files such as {refused[0]}; export them as JPEG")
         masked = settle_masks(frames, config.masks, work / "cut")
         solved, matched = _solve(masked, config, work)
         upright = _upright(solved, config)
