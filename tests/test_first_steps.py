@@ -80,6 +80,32 @@ def test_no_permission_to_write(
         pass
 
 
+def test_an_out_that_cannot_be_is_found_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("years of work")
+    folder = photographs(tmp_path / "photos")
+    for name in ("file", "file/run"):
+        out = ["--out", str(tmp_path / name)]
+        with pytest.raises(SystemExit):
+            main(["relight", str(folder), "--light", str(LIGHT), *out])
+        said = capsys.readouterr().err
+        assert "which is a file" in said and "read images" not in said
+    atomic.check_writable(tmp_path / "new" / "run")
+    assert not (tmp_path / "new").exists() and (tmp_path / "file").read_text() == "years of work"
+
+
+def test_what_may_not_be_read_is_not_said_to_be_unwritable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    denied = PermissionError(13, "Permission denied")
+    path = tmp_path / "photos" / "transforms.json"
+    assert "cannot be written" in str(atomic.explained(denied, path))
+    monkeypatch.setattr(os, "access", lambda place, mode: not (mode & os.R_OK and place == tmp_path))  # root may all
+    said = str(atomic.explained(denied, path))
+    assert "cannot be read" in said and f"permissions of {tmp_path}" in said
+    monkeypatch.setattr(os, "access", lambda place, mode: not mode & os.W_OK)
+    assert "cannot be written" in str(atomic.explained(denied, path))
+    with pytest.raises(UserError, match="no permission to write"):
+        atomic.check_writable(tmp_path / "run")
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_locked_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "locked").mkdir(mode=0o555)

@@ -40,7 +40,7 @@ from illuminerf.stages import (
     use_mesh,
 )
 from illuminerf.workflow.artefact import read_metrics
-from illuminerf.workflow.atomic import atomic_path, read_json, write_json
+from illuminerf.workflow.atomic import atomic_path, check_writable, read_json, write_json
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say
 
@@ -80,6 +80,7 @@ def relight(
     check_model(preset.relighting_model)
     if mesh is not None:
         TriangleMesh.load(mesh)  # find a bad one before anything is written
+    check_writable(out)
     shared = estimate_object(source, preset, out, mesh)
     capture, geometry, illumination = shared["capture"], shared["geometry"], shared.get("illumination")
     lights: dict[str, dict[str, Path]] = {}
