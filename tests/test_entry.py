@@ -1,10 +1,13 @@
 """The package is imported, and help is there, without anything that takes seconds to import."""
 
+import builtins
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
+import illuminerf
 from illuminerf import cli, commands, entry
 
 HEAVY = ("torch", "numpy", "mitsuba", "drjit", "diffusers", "transformers", "viser", "numba", "scipy", "skimage", "ray")
@@ -38,6 +41,78 @@ def test_the_overview_names_every_command(capsys: pytest.CaptureFixture[str]) ->
         printed = capsys.readouterr().out
         assert all(f"\n  {name} " in printed for name in (*cli.COMMANDS, *cli.GROUPS))
         assert max(map(len, printed.splitlines())) <= 120
+
+
+def told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What is printed at once for arguments that must be refused."""
+    with pytest.raises(SystemExit) as stop:
+        entry.main(arguments)
+    assert stop.value.code == 2
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["relit", "photos"], "relight"),
+        (["Relight"], "relight"),
+        (["capure"], "capture"),
+        (["rotatelight"], "rotate-light"),
+        (["lights", "previw"], "lights preview"),
+        (["light", "list"], "lights"),
+        (["wibble"], ""),
+    ],
+)
+def test_a_mistyped_command_is_one_line_with_what_was_meant(
+    arguments: list[str], meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = told(arguments, capsys)
+    assert said.startswith("error: there is no command '") and said.count("\n") == 1 and "--help" in said
+    assert f"Did you mean {meant}" in said if meant else "Did you mean" not in said
+
+
+def test_a_mistyped_command_costs_no_time() -> None:
+    code = "import contextlib\nfrom illuminerf.entry import main\nwith contextlib.suppress(SystemExit): main(['relit'])"
+    assert imported_by(code) == set()
+
+
+def test_commands_that_exist_are_let_through() -> None:
+    for arguments in (["rotate_light"], ["relight", "previw"], ["lights"], ["lights", "--help"], ["--tyro"]):
+        assert entry.unknown_command(arguments) == ""
+    assert entry.unknown_command(["lights", "polish"])
+
+
+def test_version_and_help_in_the_words_people_try(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["--version"], ["-V"], ["version"], ["help"], ["help", "presets"]):
+        with pytest.raises(SystemExit) as stop:
+            entry.main(arguments)
+        assert stop.value.code == 0
+        assert ("usage: illuminerf" if "help" in arguments else illuminerf.__version__) in capsys.readouterr().out
+
+
+def test_the_overview_fits_a_narrow_terminal() -> None:
+    assert max(map(len, entry.overview(60).splitlines())) <= 60 < max(map(len, entry.overview().splitlines()))
+
+
+def test_hints_about_a_mistyped_option_are_of_the_same_command(capsys: pytest.CaptureFixture[str]) -> None:
+    said = told(["relight", "photos", "--lights", "evening", "--out", "run"], capsys)
+    assert "--light " in said and "training-pairs" not in said and len(said.splitlines()) < 40
+
+
+def test_ctrl_c_during_the_imports_is_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = builtins.__import__
+
+    def interrupted(name: str, *arguments: Any, **named: Any) -> Any:
+        if name == "illuminerf" and "cli" in (arguments[2] or ()):
+            raise KeyboardInterrupt
+        return real(name, *arguments, **named)
+
+    monkeypatch.setattr(builtins, "__import__", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        entry.main(["presets"])
+    assert stop.value.code == 130 and "run the same command again" in capsys.readouterr().err
 
 
 def test_everything_else_goes_to_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 import os
 import shutil
 import stat
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from illuminerf.cli import main
 from illuminerf.demo import bundled_capture
 from illuminerf.films import render
 from illuminerf.run_folder import RunFolder
+from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import write_png
 from illuminerf.workflow import atomic, progress
 from illuminerf.workflow.errors import UserError
@@ -78,6 +80,32 @@ def test_no_permission_to_write(
         pass
 
 
+def test_an_out_that_cannot_be_is_found_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("years of work")
+    folder = photographs(tmp_path / "photos")
+    for name in ("file", "file/run"):
+        out = ["--out", str(tmp_path / name)]
+        with pytest.raises(SystemExit):
+            main(["relight", str(folder), "--light", str(LIGHT), *out])
+        said = capsys.readouterr().err
+        assert "which is a file" in said and "read images" not in said
+    atomic.check_writable(tmp_path / "new" / "run")
+    assert not (tmp_path / "new").exists() and (tmp_path / "file").read_text() == "years of work"
+
+
+def test_what_may_not_be_read_is_not_said_to_be_unwritable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    denied = PermissionError(13, "Permission denied")
+    path = tmp_path / "photos" / "transforms.json"
+    assert "cannot be written" in str(atomic.explained(denied, path))
+    monkeypatch.setattr(os, "access", lambda place, mode: not (mode & os.R_OK and place == tmp_path))  # root may all
+    said = str(atomic.explained(denied, path))
+    assert "cannot be read" in said and f"permissions of {tmp_path}" in said
+    monkeypatch.setattr(os, "access", lambda place, mode: not mode & os.W_OK)
+    assert "cannot be written" in str(atomic.explained(denied, path))
+    with pytest.raises(UserError, match="no permission to write"):
+        atomic.check_writable(tmp_path / "run")
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_locked_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "locked").mkdir(mode=0o555)
@@ -102,6 +130,23 @@ def test_a_narrow_terminal_loses_nothing(
     assert "3/3" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_counts_and_time_left_are_never_cut_off(
+    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "console", Console(stderr=True, width=width, force_terminal=True, no_color=True))
+    numbers = {"loss": 0.029462, "psnr": 23.066, "beta": 0.030512}
+    with progress.step_progress("fit latent NeRF", 3000) as steps:
+        steps.advance(1234, **numbers)
+    said = capsys.readouterr().err
+    assert "1234/3000" in said and "\N{HORIZONTAL ELLIPSIS}" not in said
+    assert ("beta 0.03051" in said) == (width == 120) and ("psnr" in said) == (width > 60)
+    monkeypatch.setattr(progress.StepProgress, "_room", property(lambda _: 99, lambda *_: None), raising=False)
+    with progress.step_progress("fit latent NeRF", 3000) as steps:
+        steps.advance(1234, **numbers)
+    assert ("\N{HORIZONTAL ELLIPSIS}" in capsys.readouterr().err) == (width == 60), "too much would be cut off"
+
+
 def test_a_picture_is_no_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "light.exr").write_text("not an EXR")
     folder = photographs(tmp_path / "photos")
@@ -109,6 +154,31 @@ def test_a_picture_is_no_light(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ["relight", str(folder), "--light", str(tmp_path / "light.exr"), "--out", str(tmp_path / "run")], capsys
     )
     assert "light.exr" in said and not (tmp_path / "run").exists()
+
+
+def test_a_photograph_is_no_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_png(tmp_path / "photo.png", np.ones((60, 80, 3)))
+    said = refused(["lights", "preview", str(tmp_path / "photo.png")], capsys)
+    assert "80 x 60" in said and "panorama" in said
+    with pytest.raises(UserError, match="not an equirectangular map"), warnings.catch_warnings():
+        warnings.simplefilter("error")  # that it is of low range is no matter then
+        EnvironmentMap.load(tmp_path / "photo.png")
+    write_png(tmp_path / "panorama.png", np.ones((4, 8, 3)))
+    with pytest.warns(UserWarning, match="low dynamic range"):
+        EnvironmentMap.load(tmp_path / "panorama.png")
+
+
+def test_a_mistyped_light_is_told_which_was_meant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for given, meant in (("Evening", "evening"), ("evning", "evening"), ("studo", "studio")):
+        assert f"did you mean {meant}" in refused(["lights", "preview", given], capsys)
+    assert "lights list" in refused(["lights", "preview", "my_light.exr"], capsys)
+    assert "is a folder" in refused(["lights", "preview", str(tmp_path)], capsys)
+
+
+def test_a_film_is_sent_to_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mug.mp4").write_bytes(b"frames")
+    said = refused(["relight", str(tmp_path / "mug.mp4"), "--light", "evening", "--out", str(tmp_path / "run")], capsys)
+    assert "illuminerf capture" in said
 
 
 def test_the_wrong_run_or_light(tmp_path: Path) -> None:

@@ -443,19 +443,21 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _execute(arguments: Sequence[str]) -> None:
     """Run the subcommand that the arguments name."""
-    if arguments[:1] and arguments[0] in GROUPS:
-        group = arguments[0]
-        tyro.extras.subcommand_cli_from_dict(GROUPS[group], prog=f"illuminerf {group}", args=arguments[1:])
+    name = arguments[0].replace("_", "-") if arguments else ""
+    if name in GROUPS:
+        tyro.extras.subcommand_cli_from_dict(GROUPS[name], prog=f"illuminerf {name}", args=arguments[1:])
+    elif name in COMMANDS:  # alone, so that hints about a mistyped option are of this command
+        chosen = tyro.cli(COMMANDS[name], prog=f"illuminerf {name}", args=arguments[1:])
+        if isinstance(chosen, StageCall):
+            chosen.execute()
     else:
-        chosen = tyro.extras.subcommand_cli_from_dict(
+        tyro.extras.subcommand_cli_from_dict(
             COMMANDS,
             prog="illuminerf",
             description="Relight photographed objects. Also: "
             + ", ".join(f"illuminerf {name} --help" for name in GROUPS),
             args=arguments,
         )
-        if isinstance(chosen, StageCall):
-            chosen.execute()
 
 
 __all__ = ["COMMANDS", "GROUPS", "Preset", "main"]

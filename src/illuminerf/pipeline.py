@@ -40,7 +40,7 @@ from illuminerf.stages import (
     use_mesh,
 )
 from illuminerf.workflow.artefact import read_metrics
-from illuminerf.workflow.atomic import atomic_path, read_json, write_json
+from illuminerf.workflow.atomic import atomic_path, check_writable, read_json, write_json
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say
 
@@ -80,6 +80,7 @@ def relight(
     check_model(preset.relighting_model)
     if mesh is not None:
         TriangleMesh.load(mesh)  # find a bad one before anything is written
+    check_writable(out)
     shared = estimate_object(source, preset, out, mesh)
     capture, geometry, illumination = shared["capture"], shared["geometry"], shared.get("illumination")
     lights: dict[str, dict[str, Path]] = {}
@@ -191,7 +192,11 @@ def peak_memory_gb(run: Path) -> float:
 def _check(jobs: Sequence[LightJob]) -> None:
     """Find bad lights before hours are spent on the geometry."""
     if not jobs:
-        raise UserError("no light was given", fix="name at least one with --light")
+        raise UserError(
+            "no light was given",
+            wanted="a file, or a name of 'illuminerf lights list'",
+            fix="add one, such as --light evening",
+        )
     names = [job.name for job in jobs]
     if len(set(names)) < len(names):
         raise UserError("two lights have the same name", got=", ".join(names), fix="rename one of the files")

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from illuminerf.data.object_masks import settle_masks
-from illuminerf.data.photographs import GUESSED_FOCAL, photographs_of, read_shot
+from illuminerf.data.photographs import GUESSED_FOCAL, left_out, photographs_of, read_shot
 from illuminerf.workflow.errors import UserError
 
 NOISE = np.random.default_rng(0).integers(0, 255, (30, 40, 3), dtype=np.uint8)
@@ -76,6 +76,16 @@ def test_what_is_no_capture_is_refused_with_the_reason(tmp_path: Path) -> None:
     write(tmp_path / "twice", ["1.jpg", "1.png", "2.jpg"])
     with pytest.raises(UserError, match="one name"):
         photographs_of(tmp_path / "twice", "masks", 9, tmp_path)
+
+
+def test_photographs_that_are_left_out_beside_others_are_named(tmp_path: Path) -> None:
+    write(tmp_path / "phone" / "images", ["1.jpg", "2.jpg", "3.jpg"])
+    assert left_out(tmp_path / "phone") == []
+    for name in ("IMG_5.HEIC", "IMG_4.HEIC", "notes.txt"):
+        (tmp_path / "phone" / "images" / name).write_bytes(b"")
+    assert left_out(tmp_path / "phone") == ["IMG_4.HEIC", "IMG_5.HEIC"]
+    assert len(photographs_of(tmp_path / "phone", "masks", 9, tmp_path)) == 3
+    assert left_out(tmp_path / "film.mp4") == []
 
 
 def _cut_out_image(colour: tuple[int, int, int] | None) -> np.ndarray:

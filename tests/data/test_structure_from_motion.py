@@ -2,6 +2,7 @@
 
 import builtins
 import importlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ from tests.data.photographed import ring_cameras, write_photographs
 
 
 @pytest.mark.slow
-def test_poses_of_a_patterned_ball_are_those_it_was_photographed_from(tmp_path: Path) -> None:
+def test_poses_of_a_patterned_ball_are_those_it_was_photographed_from(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("pycolmap", reason="needs the extra `capture`")
     cameras = ring_cameras(8, 160)
     write_photographs(tmp_path / "photographs", cameras)
@@ -29,6 +32,7 @@ def test_poses_of_a_patterned_ball_are_those_it_was_photographed_from(tmp_path: 
     masked = settle_masks(frames, "auto", tmp_path)
     images = write_matching_images(masked, "object", 1600, tmp_path / "work")
     solved = solve(images, tmp_path / "work", SolverConfig(threads=1, max_attempts=2))
+    assert "bundle_adjustment" not in capfd.readouterr().err, "COLMAP's own log is not for people"
     placed = list(solved.cameras)
     assert len(placed) >= 7
     found = np.stack([solved.cameras[view].world_from_camera for view in placed])
@@ -43,6 +47,14 @@ def test_poses_of_a_patterned_ball_are_those_it_was_photographed_from(tmp_path: 
     assert np.median(np.abs(radius - 1)) < 0.03  # the points lie on the ball
     first = solved.cameras[placed[0]]
     assert first.intrinsics[0] == pytest.approx(208, rel=0.1) and np.isfinite(first.error)
+
+
+def test_what_a_library_logs_is_kept_away(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError, match="kept"), structure_from_motion._silenced():
+        os.write(2, b"I20261126 === Global bundle adjustment ===")
+        raise ValueError("errors are kept")
+    os.write(2, b"heard")
+    assert capfd.readouterr().err == "heard"
 
 
 def test_without_pycolmap_the_way_out_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
 """Texture atlas, unlit GLB, coloured PLY: read back by an independent reader, colours where they belong."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,21 @@ def test_vertex_colours_are_linear_as_gltf_demands(tmp_path: Path) -> None:
     stored = np.frombuffer(raw, "<u2", len(mesh.vertices) * 4, start).reshape(-1, 4) / 65535
     np.testing.assert_allclose(stored[:, :3], linear_from_srgb(srgb), atol=1e-4)
     assert np.abs(stored[:, :3] - srgb).max() > 0.1 and (stored[:, 3] == 1).all()
+
+
+def test_every_buffer_view_says_what_it_is_for(tmp_path: Path) -> None:
+    mesh = sphere_mesh(1)
+    atlas = TriangleAtlas(len(mesh.faces))
+    save_textured_glb(tmp_path / "textured.glb", mesh, atlas, painted(mesh, atlas))
+    coloured = TriangleMesh(mesh.vertices, mesh.faces, mesh.vertex_normals, colour_at(mesh.vertices))
+    save_coloured_glb(tmp_path / "coloured.glb", coloured)
+    targets = {}
+    for name in ("textured", "coloured"):
+        raw = (tmp_path / f"{name}.glb").read_bytes()
+        document = json.loads(raw[20 : 20 + int.from_bytes(raw[12:16], "little")])
+        targets[name] = [view.get("target") for view in document["bufferViews"]]
+    vertices, indices, picture = 34962, 34963, None
+    assert targets == {"textured": [vertices, vertices, picture], "coloured": [vertices, vertices, indices]}
 
 
 def test_glb_is_read_by_our_own_reader(tmp_path: Path) -> None:

@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,20 @@ def test_glb_round_trip_is_exact_and_stands_upright(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.faces, stretched.faces)
     raw = trimesh.load_scene(str(tmp_path / "mesh.glb"))
     assert raw.extents[1] == pytest.approx(6, rel=1e-2), "glTF is y-up: our z must be its y"
+
+
+def test_a_mesh_without_colours_is_no_metal(tmp_path: Path) -> None:
+    """glTF's material for what has none is a metal, which programs show black where nothing surrounds it."""
+    sphere = sphere_mesh(1)
+    materials = {}
+    for name, colours in (("plain", None), ("coloured", np.full((len(sphere.vertices), 3), 0.5, np.float32))):
+        TriangleMesh(sphere.vertices, sphere.faces, sphere.vertex_normals, colours).save_glb(tmp_path / "mesh.glb")
+        raw = (tmp_path / "mesh.glb").read_bytes()
+        document = json.loads(raw[20 : 20 + int.from_bytes(raw[12:16], "little")])
+        (primitive,) = document["meshes"][0]["primitives"]
+        assert ("COLOR_0" in primitive["attributes"]) == (name == "coloured")
+        materials[name] = document.get("materials", [])[primitive.get("material", 0) :][:1]
+    assert materials["plain"][0]["pbrMetallicRoughness"]["metallicFactor"] == 0
 
 
 def test_broken_meshes_are_refused(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from illuminerf.cli import main
+from illuminerf.viewer import server
 from illuminerf.viewer.finished_run import find_run
 from illuminerf.viewer.renderer import ViewRenderer
 from illuminerf.workflow.errors import UserError
@@ -28,6 +29,21 @@ def broken(run_folder: Path, tmp_path: Path) -> Path:
 def test_unfinished_lights_are_left_out(run_folder: Path) -> None:
     run = find_run(run_folder)
     assert list(run.lights) == ["dawn", "dusk"] and run.unfinished == ("noon",)
+
+
+def test_ctrl_c_is_how_the_viewer_ends(
+    run_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("viser", reason="needs the extra `viewer`")
+
+    def interrupted(_: float) -> None:
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(server.time, "sleep", interrupted)
+    main(["view", str(run_folder), "--port", "8731"])
+    said = capsys.readouterr().err
+    assert "the viewer has ended" in said and "run the same command again" not in said
 
 
 def test_a_folder_that_is_no_run(tmp_path: Path, broken: Path) -> None:

@@ -21,7 +21,7 @@ _OUTLINE, _PALE = np.array([255, 40, 120], np.uint8), 0.5
 _PAGE_STYLE = (
     STYLE
     + """
-#world { width: 100%; height: 28rem; border: 1px solid var(--line); border-radius: 6px; cursor: grab }
+#world { width: 100%; height: min(28rem, 60vh); border: 1px solid var(--line); border-radius: 6px; cursor: grab }
 #world { touch-action: none }
 .row img { height: auto; width: 9.5rem } figure:target { outline: 3px solid #ff2878; border-radius: 6px }
 ul.warnings { border-left: 4px solid #e0a000; padding: .4rem 0 .4rem 2rem }

@@ -77,18 +77,28 @@ def _image_files(source: Path) -> list[Path]:
             wanted=f"a folder of photographs, or a video ({', '.join(VIDEO_SUFFIXES)})",
             fix="check the path",
         )
-    folder = source / "images" if (source / "images").is_dir() else source
-    files = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
-    found = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
-    refused = [path.name for path in files if path.suffix.lower() in _REFUSED_SUFFIXES]
+    found = [path for path in _files(source) if path.suffix.lower() in IMAGE_SUFFIXES]
+    refused = left_out(source)
     if refused and not found:
         raise UserError(
             "the photographs are in a format that is not read",
-            got=f"{len(refused)} files such as {sorted(refused)[0]}",
+            got=f"{len(refused)} files such as {refused[0]}",
             wanted=", ".join(IMAGE_SUFFIXES),
             fix="export them as JPEG or PNG in sRGB",
         )
     return sorted(found, key=lambda path: natural_order(path.name))
+
+
+def left_out(source: Path) -> list[str]:
+    """Names of photographs in a folder whose format is not read; none where `source` is a video."""
+    return sorted(path.name for path in _files(source) if path.suffix.lower() in _REFUSED_SUFFIXES)
+
+
+def _files(source: Path) -> list[Path]:
+    folder = source / "images" if (source / "images").is_dir() else source
+    if not folder.is_dir():
+        return []
+    return [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
 
 
 def _unposed(path: Path, mask: Path | None) -> SourceFrame:

@@ -17,7 +17,12 @@ def detect_format(root: Path, split: str) -> CaptureFormat:
     if not root.exists():
         raise UserError("the capture folder does not exist", got=str(root), wanted="a folder of posed images")
     if not root.is_dir():
-        raise UserError("the capture is not a folder", got=str(root), wanted="a folder of posed images")
+        raise UserError(
+            "the capture is not a folder",
+            got=str(root),
+            wanted="a folder of posed images",
+            fix="a video: run `illuminerf capture` on it first, see docs/own_photos.md",
+        )
     if is_tensoir_scene(root):
         return "tensoir"
     if transforms_file(root, split):

@@ -7,9 +7,11 @@ stand oblique views better, and by solving for all cameras at once. The attempt 
 """
 
 import importlib
+import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +26,8 @@ _NEIGHBOURS = 12
 _RELIABLE_PIXELS = 0.5
 """Reprojection errors well beyond this are put down to wrong matches."""
 _ENOUGH_POINTS = 30
+_FATAL = 3
+"""Of the levels of pycolmap's log, the last."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ def load_pycolmap() -> Any:
             got=str(error),
             fix="pip install 'illuminerf[capture]', or bring poses of your own (docs/captures.md)",
         ) from error
-    pycolmap.logging.minloglevel = 3
+    pycolmap.logging.minloglevel = _FATAL
     return pycolmap
 
 
@@ -253,7 +257,23 @@ class _Solver:
         options.ceres.loss_function_scale = _RELIABLE_PIXELS
         options.ceres.solver_options.num_threads = self._num_threads()
         options.print_summary = False
-        self.colmap.bundle_adjustment(model, options)
+        with _silenced():
+            self.colmap.bundle_adjustment(model, options)
+        self.colmap.logging.minloglevel = _FATAL
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Nothing that is written to the standard error meanwhile is seen: the last adjustment turns pycolmap's log on,
+    whatever was asked for."""
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _strict(options: Any) -> None:

@@ -23,6 +23,7 @@ from illuminerf.workflow.atomic import write_bytes
 
 _UNSIGNED_SHORT, _UNSIGNED_INT, _FLOAT = 5123, 5125, 5126
 _LINEAR, _CLAMP_TO_EDGE = 9729, 33071
+_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
 def save_textured_glb(path: Path, mesh: TriangleMesh, atlas: TriangleAtlas, srgb: np.ndarray) -> None:
@@ -118,9 +119,14 @@ def _textured(positions: np.ndarray) -> dict[str, Any]:
 
 def _glb(document: dict[str, Any], parts: list[bytes]) -> bytes:
     """Container of one JSON and one binary chunk; every part starts at a multiple of four bytes."""
+    primitive = document["meshes"][0]["primitives"][0]
+    target = {document["accessors"][i]["bufferView"]: _ARRAY_BUFFER for i in primitive["attributes"].values()}
+    if "indices" in primitive:
+        target[document["accessors"][primitive["indices"]]["bufferView"]] = _ELEMENT_ARRAY_BUFFER
     views, binary = [], b""
-    for part in parts:
-        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(part)})
+    for number, part in enumerate(parts):
+        use = {"target": target[number]} if number in target else {}
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(part), **use})
         binary += part + b"\0" * (-len(part) % 4)
     document = {**document, "bufferViews": views, "buffers": [{"byteLength": len(binary)}]}
     text = json.dumps(document, separators=(",", ":")).encode()

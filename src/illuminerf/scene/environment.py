@@ -39,7 +39,7 @@ class EnvironmentMap:
                 f"{label} is not an equirectangular map",
                 got=f"{image.shape[1]} x {image.shape[0]} pixels" if image.ndim == 3 else f"shape {image.shape}",
                 wanted="width twice the height, 3 channels",
-                fix="crop or resample it to 2:1",
+                fix="choose a panorama of all directions, made for lighting; an ordinary photograph is none",
             )
         if not np.isfinite(image).all():
             raise UserError(
@@ -77,13 +77,6 @@ class EnvironmentMap:
             image = read_hdr(path)
         elif is_low_range(path):
             image = expanded(linear_from_srgb(read_png(path)[..., :3]), ldr_peak)
-            outcome = (
-                "are cut off at 1, so shadows will be too soft and highlights too dark. Prefer an .exr or .hdr map, "
-                "or guess with --ldr-peak how bright they are"
-                if ldr_peak == 1
-                else f"are taken to reach {ldr_peak:g}, which is a guess. Prefer an .exr or .hdr map"
-            )
-            warnings.warn(f"{path.name} is a low dynamic range image: lamps and the sun {outcome}.", stacklevel=2)
         else:
             raise UserError(
                 f"{path.name} is not a known kind of light",
@@ -93,7 +86,16 @@ class EnvironmentMap:
         # resampling filters undershoot beside lamps: a small dip is rounding, a larger one a broken file
         if np.isfinite(image).all() and -_UNDERSHOOT * image.mean() < image.min() < 0:
             image = np.maximum(image, 0)
-        return EnvironmentMap(np.ascontiguousarray(image, np.float32), path.stem)
+        light = EnvironmentMap(np.ascontiguousarray(image, np.float32), path.stem)
+        if is_low_range(path):
+            outcome = (
+                "are cut off at 1, so shadows will be too soft and highlights too dark. Prefer an .exr or .hdr map, "
+                "or guess with --ldr-peak how bright they are"
+                if ldr_peak == 1
+                else f"are taken to reach {ldr_peak:g}, which is a guess. Prefer an .exr or .hdr map"
+            )
+            warnings.warn(f"{path.name} is a low dynamic range image: lamps and the sun {outcome}.", stacklevel=2)
+        return light
 
     def save(self, path: Path) -> None:
         """Write as single-precision linear EXR (the sun does not fit into a half)."""

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from PIL import Image
-from trimesh.visual import TextureVisuals
+from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from illuminerf.scene.images import linear_from_srgb, to_uint8
@@ -35,7 +35,7 @@ def write_example_assets(folder: Path, resolution: int = 96, light_height: int =
     for name, item in zip(_STILL_LIFE_NAMES, duck_still_life(resolution), strict=True):
         write_bytes(objects / f"{name}.glb", _colored_glb(item))
     write_bytes(objects / "torus.glb", _textured_torus_glb())
-    _pebble().save_glb(objects / "pebble.glb")
+    write_bytes(objects / "pebble.glb", _glb(_pebble(), ColorVisuals()))
     for name, light in NAMED_LIGHTS.items():
         light.make(light_height).save(lights / f"{name}.exr")
     return objects, lights
@@ -88,7 +88,7 @@ def _pebble() -> TriangleMesh:
     )
 
 
-def _glb(mesh: TriangleMesh, visual: TextureVisuals) -> bytes:
+def _glb(mesh: TriangleMesh, visual: ColorVisuals | TextureVisuals) -> bytes:
     turned = trimesh.Trimesh(
         mesh.vertices @ GLTF_FROM_WORLD.T,
         mesh.faces,

@@ -6,6 +6,8 @@ from typing import Literal
 
 import numpy as np
 import trimesh
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from illuminerf.scene.images import linear_from_srgb, to_uint8
 from illuminerf.scene.mesh_claims import check_claims
@@ -15,6 +17,7 @@ from illuminerf.workflow.errors import UserError
 # glTF is y-up: (x, y, z) of our z-up world is written as (x, z, -y)
 GLTF_FROM_WORLD = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
 UpAxis = Literal["auto", "y", "z"]
+_CLAY = PBRMaterial(name="clay", baseColorFactor=[0.6, 0.6, 0.6, 1.0], metallicFactor=0.0, roughnessFactor=1.0)
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,8 @@ class TriangleMesh:
             raise UserError("the mesh has faces that name vertices it does not have")
 
     def save_glb(self, path: Path) -> None:
-        """Write binary glTF 2.0, turned to its y-up axes, atomically; normals and colours are kept."""
+        """Write binary glTF 2.0, turned to its y-up axes, atomically; normals and colours are kept, and what
+        has no colours is grey."""
         colors = None
         if self.vertex_colors is not None:
             colors = to_uint8(linear_from_srgb(self.vertex_colors))  # glTF vertex colours are linear
@@ -53,6 +57,8 @@ class TriangleMesh:
             vertex_colors=colors,
             process=False,
         )
+        if self.vertex_colors is None:  # what has no material is a metal in glTF, and black where nothing surrounds it
+            mesh.visual = TextureVisuals(material=_CLAY)
         write_bytes(path, trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=True))
 
     @staticmethod

@@ -1,5 +1,6 @@
 """Lights made from formulas, known by name wherever a light's file can be given."""
 
+import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,10 +61,11 @@ def find_light(light: Path, ldr_peak: float = 1.0) -> EnvironmentMap:
     if Path(light).is_file():
         return EnvironmentMap.load(light, ldr_peak)
     if str(light) not in NAMED_LIGHTS:
+        close = difflib.get_close_matches(str(light).lower(), NAMED_LIGHTS, n=1)
         raise UserError(
-            f"the light {light} does not exist",
+            f"the light {light} is a folder" if Path(light).is_dir() else f"the light {light} does not exist",
             wanted=f"an .exr, .hdr, .png or .jpg file, or one of {', '.join(NAMED_LIGHTS)}",
-            fix="check the path, or see 'illuminerf lights list'",
+            fix=f"did you mean {close[0]}?" if close else "check the path, or see 'illuminerf lights list'",
         )
     return NAMED_LIGHTS[str(light)].make(_HEIGHT)
 

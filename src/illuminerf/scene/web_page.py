@@ -20,8 +20,10 @@ h1 { margin-bottom: 0 } h2 { margin-top: 2.2rem; border-bottom: 1px solid var(--
 figcaption { font-size: .8rem; opacity: .75; text-align: center } img, video { border-radius: 6px; max-width: 100% }
 img { image-rendering: auto; height: 9.5rem } img.wide { height: 7rem } img.tall { height: 28rem }
 video { height: 18rem; background: #fff }
-table { border-collapse: collapse } td, th { padding: .25rem .9rem .25rem 0; text-align: right }
+table { border-collapse: collapse; display: block; overflow-x: auto }
+td, th { padding: .25rem .9rem .25rem 0; text-align: right }
 td:first-child, th:first-child { text-align: left } th { border-bottom: 1px solid var(--line) }
+@media (max-width: 30rem) { table { font-size: .85rem } td, th { padding-right: .5rem } }
 """
 
 

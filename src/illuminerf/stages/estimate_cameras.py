@@ -22,7 +22,7 @@ from illuminerf.data.capture_warnings import Quality, warnings_of
 from illuminerf.data.developing import develop, plan_sizes, planned_cameras
 from illuminerf.data.matching_images import Matched, small_photograph, write_matching_images
 from illuminerf.data.object_masks import Masked, MaskSource, settle_masks
-from illuminerf.data.photographs import photographs_of, read_shot
+from illuminerf.data.photographs import left_out, photographs_of, read_shot
 from illuminerf.data.placement import Ball, focus_ball, hull_ball, mask_preview
 from illuminerf.data.solved_cameras import Solved
 from illuminerf.data.source import SourceCapture, SourceFrame
@@ -31,7 +31,7 @@ from illuminerf.data.video_frames import sharpness
 from illuminerf.data.world_alignment import Similarity, levelled, up_axis
 from illuminerf.scene.cameras import Cameras
 from illuminerf.workflow.artefact import fingerprint, open_artefact
-from illuminerf.workflow.atomic import write_bytes, write_json
+from illuminerf.workflow.atomic import check_writable, write_bytes, write_json
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say, track
 
@@ -89,7 +89,10 @@ def run(photographs: Path, config: Config, out: Path) -> Path:
         if (out / "DONE").exists():
             with open_artefact(out, "estimate_cameras", config, inputs):
                 return out
+        check_writable(out)
         frames = photographs_of(photographs, config.mask_folder, config.num_frames, work / "frames")
+        if refused := left_out(photographs):
+            say(f"left out, for they are not read: {len(refused)} files such as {refused[0]}; export them as JPEG")
         masked = settle_masks(frames, config.masks, work / "cut")
         solved, matched = _solve(masked, config, work)
         upright = _upright(solved, config)

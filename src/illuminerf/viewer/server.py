@@ -41,6 +41,8 @@ def view_command(run: Path, host: str, port: int, size: int, device: str) -> Non
     try:
         while True:
             time.sleep(3600)
+    except KeyboardInterrupt:
+        say("the viewer has ended")
     finally:
         viewer.stop()
 

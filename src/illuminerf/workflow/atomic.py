@@ -147,6 +147,9 @@ def explained(error: OSError, path: Path) -> Exception:
             fix="free some space and run the same command again; finished work is kept",
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        place = _nearest(path)
+        if not os.access(place, os.R_OK | os.X_OK if place.is_dir() else os.R_OK):
+            return UserError(f"{path} cannot be read", got=reason, fix=f"see to the permissions of {place}")
         return UserError(f"{path} cannot be written", got=reason, fix="choose another --out")
     if error.errno in (errno.ENOTDIR, errno.EEXIST):
         return UserError(f"{path.parent} is not a folder", fix="choose another --out")
@@ -159,3 +162,23 @@ def explained(error: OSError, path: Path) -> Exception:
             fix="see that the disk or network share answers, and run the same command again; finished work is kept",
         )
     return error
+
+
+def check_writable(folder: Path) -> None:
+    """Find out before long work that a folder can be made, and written to; nothing is made.
+
+    Raises:
+        UserError: it cannot.
+    """
+    place = _nearest(folder)
+    if not place.is_dir():
+        raise UserError(f"{folder} cannot be written", got=f"{place}, which is a file", fix="choose another --out")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise UserError(
+            f"{folder} cannot be written", got=f"no permission to write to {place}", fix="choose another --out"
+        )
+
+
+def _nearest(path: Path) -> Path:
+    """`path`, or the first folder above it that exists."""
+    return next(place for place in (path, *path.absolute().parents) if os.path.lexists(place))

@@ -20,6 +20,7 @@ from illuminerf.workflow.heartbeat import alive
 
 Item = TypeVar("Item")
 _LOG_EVERY_SECONDS = 15.0
+_NARROW, _NARROW_BAR, _BAR, _TIME_WIDTH = 100, 10, 30, 7
 console = Console(stderr=True, soft_wrap=True)
 
 
@@ -32,13 +33,12 @@ class StepProgress:
         self._last_line = self._start
         self._bar: Progress | None = None
         if console.is_terminal and not console.quiet and console.width >= 40:
-            narrow = console.width < 100
-            columns = [
-                TextColumn("{task.description}", markup=False),
-                BarColumn(bar_width=10 if narrow else 30),
-                MofNCompleteColumn(),
-            ]
-            columns += [TimeRemainingColumn()] if narrow else [TimeElapsedColumn(), TimeRemainingColumn()]
+            is_narrow = console.width < _NARROW
+            bar, times = (_NARROW_BAR if is_narrow else _BAR), [TimeRemainingColumn()]
+            columns = [TextColumn("{task.description}", markup=False), BarColumn(bar_width=bar), MofNCompleteColumn()]
+            columns += times if is_narrow else [TimeElapsedColumn(), *times]
+            used = len(description) + bar + 2 * len(str(total)) + 1 + (len(columns) - 3) * _TIME_WIDTH
+            self._room = console.width - used - len(columns)
             self._bar = Progress(*columns, TextColumn("{task.fields[note]}", markup=False), console=console)
             self._task = self._bar.add_task(description, total=total, completed=completed, note="")
 
@@ -46,7 +46,10 @@ class StepProgress:
         """Count `steps` more; `numbers` are shown beside the bar, e.g. psnr=27.1."""
         alive()
         self.completed += steps
-        note = " ".join(f"{name} {value:.4g}" for name, value in numbers.items())
+        parts = [f"{name} {value:.4g}" for name, value in numbers.items()]
+        while self._bar is not None and parts and len(" ".join(parts)) > self._room:
+            parts.pop()  # else counts and time would be cut off
+        note = " ".join(parts)
         if self._bar is not None:
             self._bar.update(self._task, completed=self.completed, note=note)
             return
