@@ -109,6 +109,7 @@ CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "path with dots": (frame("file_path", "../outside.png"), "outside its own folder"),
     "absolute path": (frame("file_path", "/etc/hostname"), "outside its own folder"),
     "mask outside": (frame("mask_path", "../../mask.png"), "outside its own folder"),
+    "endless name": (frame("file_path", "a" * 300 + ".png"), "cannot be resolved"),
     "link to outside": (link_out, "outside its own folder"),
     "sizes differ": (resize_first, "differing size"),
     "other aspect": (lambda root: Image.new("RGBA", (20, 20)).save(root / "images/00.png"), "another shape"),

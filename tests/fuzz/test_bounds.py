@@ -90,6 +90,12 @@ def field_bomb(path: Path) -> Path:
     return path
 
 
+def empty_capture_bomb(path: Path) -> Path:
+    content = json.loads((capture_bomb(path) / "cameras.json").read_text())
+    (path / "cameras.json").write_text(json.dumps(content | {"frames": [], "height": 2**63}))
+    return path
+
+
 def capture_bomb(path: Path) -> Path:
     cameras = ball_cameras(4, 10, 12)
     images = [image.astype(np.float32) / 255 for image in ball_images(cameras)]
@@ -116,6 +122,7 @@ BOMBS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "header.safetensors": (header_bomb, load_checkpoint),
     "field": (field_bomb, load_field),
     "capture": (capture_bomb, load_capture),
+    "empty capture": (empty_capture_bomb, load_capture),
 }
 
 

@@ -1,3 +1,5 @@
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ from illuminerf.scene.images import (
     linear_from_srgb,
     read_exr,
     read_png,
+    read_png_bytes,
     srgb_from_linear,
     write_exr,
     write_png,
@@ -40,6 +43,15 @@ def test_torch_and_numpy_agree_and_gradients_are_finite() -> None:
 def test_compositing() -> None:
     colour, alpha = np.full((2, 2, 3), 0.4), np.array([[0.0, 0.5], [1.0, 0.25]])
     np.testing.assert_allclose(composite(colour, alpha, 1.0)[..., 0], [[1.0, 0.7], [0.4, 0.85]])
+
+
+def test_transparency_without_a_palette_is_an_error_that_names_the_file(tmp_path: Path) -> None:
+    header = struct.pack(">IIBBBBB", 1, 1, 8, 3, 0, 0, 0)  # indexed colours
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(2))), (b"tRNS", b"\0"), (b"IEND", b""))
+    parts = (struct.pack(">I", len(b)) + k + b + struct.pack(">I", zlib.crc32(k + b)) for k, b in chunks)
+    (tmp_path / "bare.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    with pytest.raises(UserError, match=r"bare\.png is not a readable image"):
+        read_png_bytes(tmp_path / "bare.png")
 
 
 def test_png_round_trip(tmp_path: Path) -> None:

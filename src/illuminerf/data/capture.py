@@ -123,8 +123,9 @@ def load_capture(folder: Path) -> Capture:
     cameras = load_cameras(folder)
     content = read_json(folder / "capture.json")
     num_views = len(cameras)
-    if num_views:
-        _check_size(folder, cameras)
+    if not num_views:
+        raise UserError(f"the capture {folder} has no views", fix="import the photographs again into a new folder")
+    _check_size(folder, cameras)
     pixels = np.empty((num_views, cameras.height, cameras.width, 4), np.uint8)
 
     def read(view: int) -> None:

@@ -67,7 +67,8 @@ def file_inside(root: Path, relative: str, declared_in: Path) -> Path:
     resolved_root = root.resolve()
     try:
         resolved = candidate.resolve()
-    except (OSError, ValueError) as error:  # a loop of links, an embedded null
+        resolved.exists()
+    except (OSError, ValueError) as error:  # a loop of links, an embedded null, a name too long for any disk
         raise UserError(
             "a capture names a file that cannot be resolved",
             got=f"{relative!r} in {declared_in}",

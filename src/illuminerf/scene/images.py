@@ -23,7 +23,7 @@ can unpack to gigabytes."""
 _MAX_VALUES = 2**29
 """Of all channels of an EXR together: 2 GiB as float32."""
 DECODING_ERRORS = (OSError, SyntaxError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, EOFError,
-                   RuntimeError, struct.error, zlib.error)  # fmt: skip
+                   AssertionError, RuntimeError, struct.error, zlib.error)  # fmt: skip
 """What image libraries raise on broken content."""
 
 
