@@ -109,6 +109,13 @@ CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "path with dots": (frame("file_path", "../outside.png"), "outside its own folder"),
     "absolute path": (frame("file_path", "/etc/hostname"), "outside its own folder"),
     "mask outside": (frame("mask_path", "../../mask.png"), "outside its own folder"),
+    "name is a table beside a split": (
+        lambda root: (
+            frame("file_path", {})(root),
+            edit_json(root, lambda c: c.update(train_filenames=["images/01.png"])),
+        ),
+        "too few views",
+    ),
     "endless name": (frame("file_path", "a" * 300 + ".png"), "cannot be resolved"),
     "link to outside": (link_out, "outside its own folder"),
     "sizes differ": (resize_first, "differing size"),

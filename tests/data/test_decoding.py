@@ -144,6 +144,12 @@ def test_exif_orientation_stands_images_upright(tmp_path: Path, orientation: int
     np.testing.assert_allclose(pixels[2:6, -6:-2, :3].mean((0, 1)), [0, 1, 0], atol=0.05)
 
 
+def test_an_orientation_that_is_no_number_is_upright(tmp_path: Path) -> None:
+    exif = b"Exif\0\0MM\0*\0\0\0\x08" + struct.pack(">HHHIII", 1, EXIF_ORIENTATION, 1, 1, 0x01000000, 0)  # a byte
+    Image.new("RGB", (40, 24)).save(tmp_path / "photo.jpg", exif=exif)
+    assert image_size(tmp_path / "photo.jpg") == (40, 24)
+
+
 def test_poses_for_the_stored_orientation_keep_it(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[EXIF_ORIENTATION] = 6

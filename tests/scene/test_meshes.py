@@ -49,6 +49,12 @@ def test_broken_meshes_are_refused(tmp_path: Path) -> None:
         TriangleMesh.load_glb(tmp_path / "mesh.glb")
 
 
+def test_a_part_of_an_obj_without_whole_faces_does_not_spoil_the_others(tmp_path: Path) -> None:
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 \nvn 0 0 1\n"
+    (tmp_path / "mesh.obj").write_text(f"{corners}f 1/1/0\nusemtl paint\nf 2/1/1 3/2/1 4//1\nf 1/1/1 4/2/1 3//1\n")
+    assert len(TriangleMesh.load(tmp_path / "mesh.obj").faces) == 2
+
+
 def test_pictures_on_a_mesh_are_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shape is all that is wanted: what a texture unpacks to must cost neither time nor memory."""
     made = Gltf()

@@ -21,7 +21,6 @@ MAX_PIXELS = 120_000_000
 EXIF_ORIENTATION = 0x0112
 _TURNED = (5, 6, 7, 8)
 """Orientations that swap width and height."""
-_DECODING_ERRORS = DECODING_ERRORS
 
 
 def _unreadable(path: Path, error: BaseException) -> UserError:
@@ -54,23 +53,24 @@ def _open(path: Path) -> Image.Image:
             wanted=f"at most {MAX_PIXELS:,} pixels",
             fix="export the image smaller",
         ) from error
-    except _DECODING_ERRORS as error:
+    except DECODING_ERRORS as error:
         raise _unreadable(path, error) from error
     _check_size(path, *image.size)
     return image
 
 
 def _orientation(path: Path, image: Image.Image) -> int:
-    """The EXIF orientation, 1 to 8; 1 is upright."""
+    """The EXIF orientation, 1 to 8; 1 is upright, and what is no number is taken for it."""
     try:
         if image.format == "PNG":  # asking Pillow for it would decode all pixels
             exif = Image.Exif()
             exif.load(image.info.get("exif", b""))
         else:
             exif = image.getexif()
-    except _DECODING_ERRORS as error:
+        orientation = exif.get(EXIF_ORIENTATION, 1)
+    except DECODING_ERRORS as error:
         raise _unreadable(path, error) from error
-    return int(exif.get(EXIF_ORIENTATION, 1))
+    return orientation if isinstance(orientation, int) else 1
 
 
 def image_size(path: Path, declared: tuple[int, int] | None = None) -> tuple[int, int]:
@@ -79,7 +79,7 @@ def image_size(path: Path, declared: tuple[int, int] | None = None) -> tuple[int
         try:
             with OpenEXR.File(str(path), header_only=True) as file:
                 low, high = file.header()["dataWindow"]
-        except _DECODING_ERRORS as error:
+        except DECODING_ERRORS as error:
             raise _unreadable(path, error) from error
         width, height = int(high[0] - low[0] + 1), int(high[1] - low[1] + 1)
     else:
@@ -94,7 +94,7 @@ def image_size(path: Path, declared: tuple[int, int] | None = None) -> tuple[int
 def _read_exr_straight(path: Path) -> np.ndarray:
     try:
         channels = read_exr(path)
-    except _DECODING_ERRORS as error:
+    except DECODING_ERRORS as error:
         raise _unreadable(path, error) from error
     grey = channels.get("Y")
     rgb = [plane for plane in (channels.get(name, grey) for name in "RGB") if plane is not None]
@@ -135,7 +135,7 @@ def read_straight(path: Path, declared: tuple[int, int] | None = None) -> np.nda
         try:
             deep = image.format == "PNG" and is_deep_colour_png(path)
             pixels = read_deep_png(path) if deep else _pillow_pixels(image)
-        except (Image.DecompressionBombError, *_DECODING_ERRORS) as error:
+        except (Image.DecompressionBombError, *DECODING_ERRORS) as error:
             raise _unreadable(path, error) from error
     return np.ascontiguousarray(_upright(pixels, orientation))
 

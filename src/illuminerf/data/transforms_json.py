@@ -79,7 +79,7 @@ def _entries_of_split(content: dict[str, Any], split: str) -> list[Any]:
     if not isinstance(chosen, list):
         return list(content["frames"])
     names = set(map(str, chosen))
-    return [entry for entry in content["frames"] if isinstance(entry, dict) and entry.get("file_path") in names]
+    return [entry for entry in content["frames"] if isinstance(entry, dict) and str(entry.get("file_path")) in names]
 
 
 def _read_frame(

@@ -116,7 +116,7 @@ def _placed(
     """Vertices, faces and normals of one node in our world, or None where it has no triangles."""
     transform, name = scene.graph[node]
     mesh = scene.geometry[name]
-    if not isinstance(mesh, trimesh.Trimesh):
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         return None
     normal_transform = np.linalg.inv(transform[:3, :3]).T
     vertices = mesh.vertices @ transform[:3, :3].T + transform[:3, 3]
