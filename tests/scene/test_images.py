@@ -1,3 +1,4 @@
+import resource
 import struct
 import zlib
 from pathlib import Path
@@ -83,3 +84,25 @@ def test_missing_and_broken_files_are_named(tmp_path: Path, reader) -> None:  # 
     (tmp_path / "broken").write_bytes(b"\x89PNG nonsense")
     with pytest.raises(UserError, match="not a readable"):
         reader(tmp_path / "broken")
+
+
+def test_an_exr_is_whole_or_an_error(tmp_path: Path) -> None:
+    """At every size that files may have at most, as on a disk that is full: the library hides what fails at its end."""
+    channels = {name: np.random.default_rng(3).random((12, 12), np.float32) for name in "RGBA"}
+    write_exr(tmp_path / "whole.exr", channels)
+    whole = (tmp_path / "whole.exr").read_bytes()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    num_refused = 0
+    for most in range(200, len(whole) + 40, 23):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+        try:
+            write_exr(tmp_path / "limited.exr", channels)
+        except UserError:
+            num_refused += 1
+            assert most < len(whole) and not (tmp_path / "limited.exr").exists()
+        else:
+            assert (tmp_path / "limited.exr").read_bytes() == whole
+            break
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert num_refused > 20

@@ -1,5 +1,6 @@
 """Shards: equal samples give equal bytes, what is damaged is seen, and the public reader can read them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -67,6 +68,18 @@ def test_damage_is_seen(storage: Storage, tmp_path: Path) -> None:
     assert not is_intact(storage, index)
     with pytest.raises(UserError, match="missing"):
         list(read_shard(storage, index))
+
+
+def test_a_changed_index_is_not_finished(storage: Storage, tmp_path: Path) -> None:
+    index = write_shard(storage, "pairs-000000", samples(), {"lost": LeftOut("crash", "it ended")})
+    path = tmp_path / "pairs-000000.json"
+    content = path.read_bytes()
+    assert read_index(storage, "pairs-000000") == index
+    for place in range(len(content)):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+        assert read_index(storage, "pairs-000000") is None, f"{content[place : place + 1]!r} at {place} is another byte"
+    path.write_bytes(content.replace(index.seal.encode(), b""))
+    assert read_index(storage, "pairs-000000") == replace(index, seal=""), "indices of before had no seal"
 
 
 def test_a_shard_without_its_index_is_not_finished(storage: Storage, tmp_path: Path) -> None:

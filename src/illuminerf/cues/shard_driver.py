@@ -73,6 +73,7 @@ def clear(storage: Storage, plan: Plan) -> None:
     for shard in plan.shards():
         clear_staging(storage, shard)
     for folder in (LIGHTS_FOLDER, "staging"):
+        storage.remove_leftovers(folder)
         for name in storage.names(folder):
             storage.remove(f"{folder}/{name}")
         storage.remove_empty(folder)

@@ -128,6 +128,9 @@ def write_exr(path: Path, channels: dict[str, np.ndarray], half: bool = True) ->
     """Write float channels [height, width] by name, atomically, in half or single precision, zip compressed.
 
     Values beyond the largest half (65504) are clamped to it.
+
+    Raises:
+        UserError: the file cannot be written.
     """
     kind = np.float16 if half else np.float32
     limit = float(np.finfo(kind).max)
@@ -135,9 +138,21 @@ def write_exr(path: Path, channels: dict[str, np.ndarray], half: bool = True) ->
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary:
         try:
-            OpenEXR.File(header, pixels).write(str(temporary))
+            OpenEXR.File(header, dict(pixels)).write(str(temporary))
         except RuntimeError as error:  # it does not say whether the disk was full
             raise OSError(errno.EIO, str(error), str(path)) from error
+        if not _holds(temporary, pixels):  # what fails while the library closes its file, it keeps to itself
+            raise OSError(errno.EIO, "a file was not written whole", str(path))
+
+
+def _holds(path: Path, pixels: dict[str, np.ndarray]) -> bool:
+    """Whether an EXR has just these channels, bit by bit."""
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            found = {name: channel.pixels for name, channel in file.channels().items()}
+    except DECODING_ERRORS:
+        return False
+    return found.keys() == pixels.keys() and all(found[name].tobytes() == pixels[name].tobytes() for name in pixels)
 
 
 def read_rgb_exr(path: Path) -> np.ndarray:

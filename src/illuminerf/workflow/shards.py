@@ -10,7 +10,7 @@ import io
 import json
 import tarfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from illuminerf.workflow.config import from_json, to_json
 from illuminerf.workflow.errors import UserError
@@ -45,6 +45,13 @@ class ShardIndex:
     """By key, the planned samples that are missing."""
     schema: int = INDEX_SCHEMA
     """Version of this layout."""
+    seal: str = ""
+    """sha256 of the rest of this index; empty where it was written before there were seals."""
+
+    def sealed(self) -> "ShardIndex":
+        """The same with its seal."""
+        rest = json.dumps(to_json(replace(self, seal="")), sort_keys=True)
+        return replace(self, seal=hashlib.sha256(rest.encode()).hexdigest())
 
 
 def sample_tar(key: str, files: dict[str, bytes]) -> bytes:
@@ -100,20 +107,22 @@ def write_shard(storage: Storage, name: str, samples: list[bytes], left_out: dic
     files = [pair for sample in samples for pair in read_samples(sample)]
     content = _tar(files)
     keys = tuple(key for key, _ in files)
-    index = ShardIndex(name, keys, hashlib.sha256(content).hexdigest(), len(content), dict(sorted(left_out.items())))
+    sha256 = hashlib.sha256(content).hexdigest()
+    index = ShardIndex(name, keys, sha256, len(content), dict(sorted(left_out.items()))).sealed()
     storage.write(f"{name}.tar", content)
     storage.write_json(f"{name}.json", to_json(index))
     return index
 
 
 def read_index(storage: Storage, name: str) -> ShardIndex | None:
-    """The index of a shard; None where it is absent, unreadable or of another layout, so that the shard counts as
+    """The index of a shard; None where it is absent, damaged or of another layout, so that the shard counts as
     unfinished."""
     try:
         index = from_json(ShardIndex, json.loads(storage.read(f"{name}.json")))
     except (FileNotFoundError, ValueError, UserError):
         return None
-    return index if index.schema == INDEX_SCHEMA and index.name == name else None
+    is_whole = index.seal in ("", index.sealed().seal)
+    return index if is_whole and index.schema == INDEX_SCHEMA and index.name == name else None
 
 
 def is_intact(storage: Storage, index: ShardIndex) -> bool:
