@@ -27,7 +27,7 @@ test: $(INSTALLED)
 test-min test-newest: test-%:
 	test -x .venv-$*/bin/python || $(PYTHON) -m venv .venv-$*
 	.venv-$*/bin/python -m pip install --quiet --upgrade $(if $(filter min,$*),--constraint constraints-min.txt) --editable '.[dev]'
-	.venv-$*/bin/python -m pytest -n 2 --dist loadfile $(TESTS)
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 .venv-$*/bin/python -m pytest -n 2 --dist loadfile $(TESTS)
 
 wheel: $(INSTALLED)
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
