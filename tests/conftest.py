@@ -5,7 +5,13 @@ from pathlib import Path
 
 import pytest
 
-import illuminerf  # noqa: F401 - before any test imports torch, so that its threads wait as the package's do
+
+def pytest_sessionstart() -> None:
+    """Import the package before any test imports torch, so that its threads wait as the package's do.
+
+    Not when this file is read: older jaxtyping hooks the package's import only after that.
+    """
+    import illuminerf  # noqa: F401
 
 
 @pytest.fixture
