@@ -30,7 +30,7 @@ class MeshScene:
         white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
         normals = mesh.vertex_normals if is_smooth else None
         shape = mitsuba_mesh(mi, "mesh", mesh.vertices, mesh.faces, white, normals)
-        self._scene = MitsubaScene({"mesh": shape}, EnvironmentMap(np.ones((2, 4, 3), np.float32)), device)
+        self._scene = MitsubaScene({"mesh": shape}, EnvironmentMap(np.ones((4, 8, 3), np.float32)), device)
 
     def normals(self, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray]:
         """Unit normals towards the camera, float32 [height, width, 3], 0 where nothing is seen, and coverage."""

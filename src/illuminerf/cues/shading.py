@@ -57,7 +57,7 @@ class ShadedScene:
             f"part{i}": _shape(mesh, material, self._device, unlit=True)
             for i, (mesh, material) in enumerate(self._parts)
         }
-        scene = MitsubaScene(shapes, EnvironmentMap(np.ones((2, 4, 3), np.float32)), self._device)
+        scene = MitsubaScene(shapes, EnvironmentMap(np.ones((4, 8, 3), np.float32)), self._device)
         first = scene.render_aovs(
             "color:albedo,normal:sh_normal,depth:depth,tangent:dp_du,flat:geo_normal",
             cameras,
