@@ -35,7 +35,7 @@ from illuminerf.stages.score_predictions import score_predictions, write_predict
 from illuminerf.workflow.artefact import read_metrics
 from illuminerf.workflow.atomic import atomic_path, read_json, write_json
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import console, say
+from illuminerf.workflow.progress import say, show_table
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def ablation_command(
     EnvironmentMap.load(light)
     views = _unseen_views(capture, light.stem, test_cameras, truth, size, every, out / "ablation" / light.stem)
     result = run(capture, light, rows_of(samples), views, settings, comparison, out, lpips)
-    console.print(ablation_table(result["rows"]))
+    show_table(ablation_table(result["rows"]))
     say(f"done: {out / 'ablation' / light.stem / 'ablation.json'}")
 
 

@@ -26,7 +26,7 @@ from illuminerf.workflow.atomic import write_bytes, write_json
 from illuminerf.workflow.device import resolve_device
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.named_folders import named_folders
-from illuminerf.workflow.progress import console, say, track
+from illuminerf.workflow.progress import say, show_table, track
 
 _ESTIMATES = {
     "": "sample",
@@ -203,7 +203,7 @@ def relighting_model_command(
         if estimate in scores:
             label = suffix.removeprefix("_").replace("_", " ") or "one sample"
             table.add_row(label, f"{named[f'psnr{suffix}']:.2f}", f"{named[f'ssim{suffix}']:.3f}")
-    console.print(table)
+    show_table(table)
 
 
 def relight_scene(
@@ -261,10 +261,10 @@ def _report(scores: dict[str, Any], covers: str, json: Path | None) -> None:
     rivals = scores.get("rivals", {})
     columns = {name: rival["psnr"] for name, rival in rivals.items()}
     table = cell_table(scores["psnr"], scores["ssim"], scores.get("lpips"), scores.get("input_light"), columns)
-    console.print(table)
+    show_table(table)
     ours = _mean_row("", scores)
     rows = [_mean_row(f"{name}, same geometry", rival) for name, rival in rivals.items()]
-    console.print(published_table(ours.psnr, ours.ssim, ours.lpips, covers, ours.seconds, rows))
+    show_table(published_table(ours.psnr, ours.ssim, ours.lpips, covers, ours.seconds, rows))
 
 
 def _mean_row(name: str, scores: dict[str, Any]) -> MeanRow:

@@ -32,7 +32,7 @@ from illuminerf.workflow.artefact import read_metrics
 from illuminerf.workflow.atomic import read_json, write_json
 from illuminerf.workflow.device import derived_seed
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import console, say
+from illuminerf.workflow.progress import say, show_table
 
 _SYMMETRIC = (1e-3, 1e-3, 1e-3)
 
@@ -135,9 +135,9 @@ def geometry_command(
     result = run(chosen, light_files(lights), settings, out)
     if json is not None:
         write_json(json, result)
-    console.print(geometry_table(result["objects"], result["mean"]))
+    show_table(geometry_table(result["objects"], result["mean"]))
     if ablations:
-        console.print(geometry_ablation_table(result["ablations"]))
+        show_table(geometry_ablation_table(result["ablations"]))
     say(f"done: {out / 'scores.json'}, {out}/<object>/scores/sheet.png")
 
 

@@ -11,7 +11,7 @@ from illuminerf.diffusion.model_tables import layer_tables, model_on_meta, param
 from illuminerf.diffusion.pretrained import EMBEDDED, model_folder, pretrained_model
 from illuminerf.diffusion.relighting_model import RelightingModel, save_model
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import console, say
+from illuminerf.workflow.progress import say, show_table
 
 
 def list_command() -> None:
@@ -23,7 +23,7 @@ def list_command() -> None:
         folders, missing = _places(model)
         where = "yes" if not missing else f"{len(missing)} files missing"
         table.add_row(model.name, model.purpose, model.size, where, escape(", ".join(map(str, folders))))
-    console.print(table)
+    show_table(table)
 
 
 def info_command(name: tyro.conf.Positional[str]) -> None:
@@ -39,14 +39,14 @@ def info_command(name: tyro.conf.Positional[str]) -> None:
     counts.add_column("parameters", justify="right")
     for part, count in parameter_counts(model).items():
         counts.add_row(part, f"{count:,}")
-    console.print(counts)
+    show_table(counts)
     for network, rows in layer_tables(model).items():
         table = Table(title=f"{network} at {model.image_size}x{model.image_size}")
         table.add_column("layer (kernel, stride, padding)")
         table.add_column("output")
         for layer in rows:
             table.add_row(layer.kind, " x ".join(map(str, layer.shape)))
-        console.print(table)
+        show_table(table)
 
 
 def download_command(name: tyro.conf.Positional[str], base: str = "", revision: str = "") -> None:

@@ -28,7 +28,7 @@ from illuminerf.stages.score_orb_predictions import (
 )
 from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.named_folders import named_folders
-from illuminerf.workflow.progress import console, say
+from illuminerf.workflow.progress import say, show_table
 
 REFERENCES = ("fixed", "per_image")
 PHOTOGRAPHS = "the photographs"
@@ -65,7 +65,7 @@ def illumination_study_command(
     captures = find_captures(root, objects)
     config = render_reference_views.Config(samples_per_pixel=samples_per_pixel, device=device, seed=seed)
     means = study(root, captures, named_folders(renderings), meshes, config, out, size, lpips)
-    console.print(study_table(means))
+    show_table(study_table(means))
     say(f"done: {out / 'study.json'}")
 
 

@@ -28,7 +28,7 @@ from illuminerf.stages.score_orb_predictions import (
 )
 from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import console, say
+from illuminerf.workflow.progress import say, show_table
 
 Illumination = Literal["fixed", "per-image"]
 
@@ -143,5 +143,5 @@ def relight_job(root: Path, job: RelightingJob, shared: dict[str, Path], preset:
 def _report(scores: dict[str, Any], covers: str, json: Path | None) -> None:
     if json is not None:
         write_json(json, scores)
-    console.print(capture_table(scores))
-    console.print(published_orb_table(scores["mean"], covers))
+    show_table(capture_table(scores))
+    show_table(published_orb_table(scores["mean"], covers))

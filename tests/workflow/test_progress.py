@@ -3,10 +3,11 @@
 import pytest
 from rich.errors import MarkupError
 from rich.markup import escape
+from rich.table import Table
 
 from illuminerf import cli
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import say, track
+from illuminerf.workflow.progress import console, say, show_table, track
 
 NAMES = "left out [/b] of [red]: pip install 'illuminerf[cluster]' :warning: C:\\d"
 
@@ -51,3 +52,13 @@ def test_presets_keep_their_names(capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["presets"])
     printed = capsys.readouterr().err
     assert "[bold]" not in printed and "embedded: " in printed
+
+
+def test_tables_are_whole_on_narrow_terminals(capsys: pytest.CaptureFixture[str]) -> None:
+    table = Table(*[f"figure {number}" for number in range(12)])
+    table.add_row(*[f"{number}.12345" for number in range(12)])
+    console.print(table)  # what it is for
+    assert "…" in capsys.readouterr().err
+    show_table(table)
+    shown = capsys.readouterr().err
+    assert all(f"{number}.12345" in shown for number in range(12)) and "…" not in shown

@@ -18,7 +18,7 @@ from illuminerf.batch.status_page import failures, status_table
 from illuminerf.batch.steps import Outcome, Task, run_step
 from illuminerf.workflow.artefact import locked
 from illuminerf.workflow.errors import UserError
-from illuminerf.workflow.progress import console, say
+from illuminerf.workflow.progress import say, show_table
 from illuminerf.workflow.storage import Storage
 from illuminerf.workflow.task_pool import Execution, open_pool
 
@@ -48,7 +48,7 @@ def batch_command(
     file = read_jobs(jobs)
     if status:
         content = read_status(Storage(file.out))
-        console.print(status_table(content))
+        show_table(status_table(content))
         for line in failures(content):
             say(line)
         return

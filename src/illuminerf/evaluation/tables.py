@@ -107,10 +107,11 @@ def published_table(
 
 def ablation_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """One row per latent NeRF, as ablation.json has them, beside the paper's figures for TensoIR's hotdog."""
-    table = Table(title="Ablation (marked *: published for TensoIR's hotdog, 200 views under each of 5 lights)")
+    title = "Ablation (marked *: published for TensoIR's hotdog, 200 views under each of 5 lights)"
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for heading in ("S", "codes"):
         table.add_column(heading)
-    ours = ("PSNR", "SSIM", "LPIPS", "train PSNR", "samples differ", "renderings differ", "seconds")
+    ours = ("PSNR", "SSIM", "LPIPS", "train PSNR", "samples differ", "views differ", "seconds")
     for heading in (*ours, "PSNR *", "SSIM *", "LPIPS *"):
         table.add_column(heading, justify="right")
     for row in rows:

@@ -15,6 +15,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 
 from illuminerf.workflow.heartbeat import alive
 
@@ -99,3 +100,15 @@ def say(message: str, *, markup: bool = False) -> None:
             must then have gone through `rich.markup.escape`, or it loses its brackets or does not print at all.
     """
     console.print(message, highlight=False, markup=markup, emoji=False)
+
+
+def show_table(table: Table) -> None:
+    """Print a table with all words and numbers whole; where the terminal is too narrow for that it runs past the edge.
+
+    Rich would cut them, widest column first, and half a figure tells nothing.
+    """
+    unbound = console.options.update(max_width=10_000)
+    for column in table.columns:
+        cells = (column.header, *column.cells, column.footer)
+        column.min_width = max(console.measure(cell, options=unbound).minimum for cell in cells)
+    console.print(table, crop=False, soft_wrap=False)
