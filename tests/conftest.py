@@ -5,13 +5,7 @@ from pathlib import Path
 
 import pytest
 
-
-def pytest_sessionstart() -> None:
-    """Import the package before any test imports torch, so that its threads wait as the package's do.
-
-    Not when this file is read: older jaxtyping hooks the package's import only after that.
-    """
-    import illuminerf  # noqa: F401
+import illuminerf  # noqa: F401 - before any test imports torch, so that its threads wait as the package's do
 
 
 @pytest.fixture
