@@ -32,7 +32,7 @@ class Browser:
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         port_file = Path(self._folder.name) / "DevToolsActivePort"
-        wait_for(port_file.exists, 90)
+        wait_for(lambda: port_file.exists() and len(port_file.read_text().split()) == 2, 90)  # it is made empty
         port, path = port_file.read_text().split()
         self._socket = connect(f"ws://127.0.0.1:{port}{path}", max_size=None)
         self._count, self._session, self.errors = 0, "", list[str]()
