@@ -64,6 +64,7 @@ ABLATIONS: dict[str, Ablation] = {
     "no_normal_smoothness": _with_losses(normal_smoothness=0.0),
     "sphere_start": _with_losses(starts_from_hull=False),
     "black_background": _with_losses(random_background=False),
+    "even_rays": _with_losses(guided_share=0.0),
 }
 """What each changes of a geometry's settings: one thing."""
 

@@ -12,19 +12,8 @@ from illuminerf.fields.bounds import (
     visual_hull,
 )
 from illuminerf.fields.ray_pool import gather_rays
-from illuminerf.scene.cameras import Cameras, sphere_cameras
 from illuminerf.workflow.errors import UserError
-
-
-def _sphere_views(radius: float, num_views: int = 24) -> tuple[Cameras, np.ndarray]:
-    """Masks of a sphere about the origin, seen from a distance of 3."""
-    cameras = sphere_cameras(num_views, 3.0, 0.8, 48, 48, np.random.default_rng(0))
-    masks = []
-    for view in range(num_views):
-        origins, directions = cameras.image_rays(view)
-        near, far = ball_interval(origins.reshape(-1, 3), directions.reshape(-1, 3), radius)
-        masks.append((far > near).reshape(48, 48).numpy())
-    return cameras, np.stack(masks).astype(np.float32)
+from tests.fields.sphere_views import sphere_views
 
 
 def test_ball_interval() -> None:
@@ -50,7 +39,7 @@ def test_march_kernel_equals_twin() -> None:
 
 
 def test_visual_hull_of_a_sphere_is_about_that_sphere() -> None:
-    cameras, masks = _sphere_views(0.5)
+    cameras, masks = sphere_views(0.5)
     hull = OccupiedCells(visual_hull(cameras, masks, 32))
     shell = functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     assert bool(hull.contains(0.49 * shell).all())
@@ -60,13 +49,13 @@ def test_visual_hull_of_a_sphere_is_about_that_sphere() -> None:
 
 
 def test_masks_that_contradict_the_cameras() -> None:
-    cameras, masks = _sphere_views(0.5)
+    cameras, masks = sphere_views(0.5)
     with pytest.raises(UserError, match="inside all masks"):
         visual_hull(cameras, np.zeros_like(masks), 16)
 
 
 def test_ray_pool_holds_all_foreground_and_little_else() -> None:
-    cameras, masks = _sphere_views(0.5, num_views=8)
+    cameras, masks = sphere_views(0.5, num_views=8)
     pool = gather_rays(cameras, masks, OccupiedCells(visual_hull(cameras, masks, 32)).dilated(1))
     assert pool.num_foreground == int(masks.sum())
     assert pool.num_foreground < len(pool) < 2.5 * pool.num_foreground
@@ -80,7 +69,7 @@ def test_ray_pool_holds_all_foreground_and_little_else() -> None:
 
 
 def test_values_of_a_pool_are_those_of_its_pixels() -> None:
-    cameras, masks = _sphere_views(0.5, num_views=4)
+    cameras, masks = sphere_views(0.5, num_views=4)
     pool = gather_rays(cameras, masks, OccupiedCells(visual_hull(cameras, masks, 32)).dilated(1))
     images = np.random.default_rng(0).random((4, 48, 48, 3), np.float32)
     wanted = torch.from_numpy(images.reshape(4, -1, 3))[pool.view.long(), pool.pixel.long()]

@@ -11,6 +11,7 @@ from illuminerf.fields.bounds import OccupiedCells, signed_distance_of_cells
 from illuminerf.fields.hash_grid import coarse_to_fine_weights
 from illuminerf.fields.proposal_sampling import interlevel_loss
 from illuminerf.fields.radiance_field import RadianceField
+from illuminerf.fields.ray_guide import RayGuide
 from illuminerf.fields.ray_pool import RayPool
 from illuminerf.fields.step_draws import StepDraws
 from illuminerf.workflow.device import torch_generator
@@ -36,6 +37,9 @@ class GeometryLossConfig:
     random_background: bool = True
     """Where there are masks, each ray and its pixel are laid over one colour, drawn anew at every step. False: over
     black, for comparison."""
+    guided_share: float = 0.5
+    """Share of each batch that is drawn where the error is (see `RayGuide`), once a tenth of the fit is over; 0 for
+    comparison."""
     smoothness_sigma: float = 0.01
     """Standard deviation of the perturbed positions (supplement A.1)."""
     first_levels: int = 4
@@ -57,6 +61,7 @@ def geometry_loss(
     progress: float,
     generator: torch.Generator,
     team: Team = ALONE,
+    guide: RayGuide | None = None,
 ) -> tuple[Tensor, dict[str, float]]:
     """Loss of one batch of rays, or of the share of it that is this process's, with numbers to show.
 
@@ -65,9 +70,10 @@ def geometry_loss(
         target_alpha: coverage; None where the capture has no masks.
         index: the rays of this batch, all processes' together.
         progress: share of the fit that is over.
+        guide: takes in the rays' errors.
     """
     draws = StepDraws(generator, len(index), team)
-    batch, index = len(index), index[draws.own]
+    batch, all_rays, index = len(index), index, index[draws.own]
     device = index.device
     origins, directions, near, far = pool.rays(index)
     phase = progress / max(config.coarse_to_fine_share, 1e-6)
@@ -93,6 +99,8 @@ def geometry_loss(
         wanted = wanted + (1 - target_alpha[index])[:, None] * behind
     # Charbonnier as in camp_zipnerf: against the squared error's ever smaller gradient the smoothness terms win
     squared = losses.colour_loss(srgb.detach(), wanted)
+    if guide is not None:
+        guide.update(all_rays, (srgb.detach() - wanted).abs().mean(-1), team)
     total = losses.robust_colour_loss(srgb, wanted) + config.eikonal * losses.eikonal_loss(gradients)
     total = total + interlevel_loss(samples.edges, samples.weights, samples.proposal_edges, samples.proposal_weights)
     rays = len(index)

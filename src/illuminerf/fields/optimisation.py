@@ -6,7 +6,7 @@ rounding; with the same number of processes it is the same bytes again (on CPUs)
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,15 +72,18 @@ def fit(
     description: str,
     start: Callable[[], None] | None = None,
     team: Team = ALONE,
+    state: Mapping[str, Tensor] | None = None,
 ) -> None:
     """Minimise `step_loss` over the parameters of `module` that require a gradient.
 
     Args:
         step_loss: from the step to the loss (its mean over this process's share of the rays) and numbers to show. All
-            randomness must derive from the step, which is what makes a resumed fit equal to an uninterrupted one.
+            randomness must derive from the step, and what it remembers be in `state`, which is what makes a resumed fit
+            equal to an uninterrupted one.
         checkpoint: where state is kept; the caller deletes it when the artefact is whole.
         start: called once before the first step, not on resume.
         team: whose first process writes checkpoints.
+        state: tensors that steps change in place, kept in checkpoints too.
 
     Raises:
         UserError: a step has fewer rays than there are processes.
@@ -89,10 +92,11 @@ def fit(
     if rays < team.count:
         raise UserError("a step needs a ray per process", got=f"{rays} rays, {team.count} processes")
     parameters = {name: p for name, p in module.named_parameters() if p.requires_grad}
+    state = state or {}
     optimiser = torch.optim.Adam(list(parameters.values()), betas=(0.9, 0.99), eps=1e-15, fused=True)
     first = 0
     if team.agreed(checkpoint.exists()):
-        first = _restore(checkpoint, parameters, optimiser)
+        first = _restore(checkpoint, parameters, optimiser, state)
     elif start is not None:
         start()
     team.start_equal(parameters.values())
@@ -111,15 +115,23 @@ def fit(
             is_due = (step + 1) % config.checkpoint_every == 0 and step + 1 < config.num_steps
             if is_due and team.is_first:
                 tensors = {f"parameter.{name}": p for name, p in parameters.items()}
+                tensors |= {f"state.{name}": tensor for name, tensor in state.items()}
                 save_checkpoint(checkpoint, tensors | optimizer_tensors(optimiser), {"step": step + 1})
             progress.advance(1, loss=total, **numbers)
 
 
-def _restore(checkpoint: Path, parameters: dict[str, nn.Parameter], optimiser: torch.optim.Optimizer) -> int:
+def _restore(
+    checkpoint: Path,
+    parameters: Mapping[str, nn.Parameter],
+    optimiser: torch.optim.Optimizer,
+    state: Mapping[str, Tensor],
+) -> int:
     device = next(iter(parameters.values())).device
     tensors, metadata = load_checkpoint(checkpoint, device)
     with torch.no_grad():
         for name, parameter in parameters.items():
             parameter.copy_(tensors[f"parameter.{name}"])
+        for name, tensor in state.items():
+            tensor.copy_(tensors[f"state.{name}"])
     restore_optimizer(optimiser, tensors)
     return int(metadata["step"])

@@ -19,6 +19,7 @@ from illuminerf.fields.image_rendering import observed_cells, render_image
 from illuminerf.fields.meshing import extract_mesh
 from illuminerf.fields.optimisation import OptimiserConfig, fit
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
+from illuminerf.fields.ray_guide import RayGuide
 from illuminerf.fields.ray_pool import gather_rays
 from illuminerf.fields.shell import SurfaceShell, surface_shell
 from illuminerf.fields.storage import StoredField, save_field
@@ -29,6 +30,8 @@ from illuminerf.workflow.device import derived_seed, torch_generator
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.processes import Team, join, open_together
 from illuminerf.workflow.progress import say
+
+_GUIDED_FROM = 0.1  # share of the fit; before, errors are everywhere
 
 
 @dataclass(frozen=True)
@@ -138,19 +141,30 @@ def _fit(
     pool = gather_rays(views.cameras[fitted], views.alphas(fitted), hull, device)
     srgb = pool.values(views.premultiplied(fitted))
     alpha = pool.values(views.alphas(fitted)) if has_masks else None
+    guide = RayGuide(pool)
 
     def step_loss(step: int) -> tuple[torch.Tensor, dict[str, float]]:
         generator = torch_generator(config.seed, "geometry", step, device=device)
-        index = pool.draw(config.optimiser.rays_per_step, generator)
-        progress = step / config.optimiser.num_steps
-        return geometry_loss(radiance_field, config.losses, pool, srgb, alpha, index, progress, generator, team)
+        progress, rays = step / config.optimiser.num_steps, config.optimiser.rays_per_step
+        num_guided = round(rays * config.losses.guided_share) if progress >= _GUIDED_FROM else 0
+        index = torch.cat([pool.draw(rays - num_guided, generator), guide.draw(num_guided, generator)])
+        return geometry_loss(radiance_field, config.losses, pool, srgb, alpha, index, progress, generator, team, guide)
 
     def start() -> None:
         if config.losses.starts_from_hull:
             start_from_cells(radiance_field, hull, config.losses.first_levels, config.seed)
 
     with radiance_field.computing_in(config.optimiser.precision):
-        fit(radiance_field, config.optimiser, step_loss, checkpoint, "fit geometry", start, team)
+        fit(
+            radiance_field,
+            config.optimiser,
+            step_loss,
+            checkpoint,
+            "fit geometry",
+            start,
+            team,
+            {"ray_errors": guide.errors},
+        )
 
 
 def _bounds(views: Views, has_masks: bool, side: int, device: torch.device) -> OccupiedCells:

@@ -87,6 +87,15 @@ class Team:
             distributed.all_reduce(weighted)
         return weighted
 
+    def sum(self, value: Tensor) -> Tensor:
+        """The sum over all processes; no gradient."""
+        if self.is_alone:
+            return value
+        summed = value.detach().cpu()
+        with _explained():
+            distributed.all_reduce(summed)
+        return summed.to(value.device)
+
     def counts(self, own: int) -> list[int]:
         """A number from every process, in order."""
         if self.is_alone:
