@@ -114,7 +114,7 @@ def fit(
             optimiser.step()
             is_due = (step + 1) % config.checkpoint_every == 0 and step + 1 < config.num_steps
             if is_due and team.is_first:
-                tensors = {f"parameter.{name}": p for name, p in parameters.items()}
+                tensors: dict[str, Tensor] = {f"parameter.{name}": p for name, p in parameters.items()}
                 tensors |= {f"state.{name}": tensor for name, tensor in state.items()}
                 save_checkpoint(checkpoint, tensors | optimizer_tensors(optimiser), {"step": step + 1})
             progress.advance(1, loss=total, **numbers)
