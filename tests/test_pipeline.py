@@ -138,6 +138,13 @@ def test_doing_nothing_scores_what_the_rule_says() -> None:
     assert min(score_light([view_pair(image, image) for image in truth]).psnr) > 45
 
 
+def test_presets_for_a_gpu_say_so_without_one(capsys: pytest.CaptureFixture[str]) -> None:
+    customised("gpu", device="cpu")
+    assert "meant for a GPU" in capsys.readouterr().err
+    customised("embedded", device="cpu")
+    assert "GPU" not in capsys.readouterr().err
+
+
 def test_every_preset_says_what_it_is_for() -> None:
     assert all(len(preset.description) > 40 for preset in PRESETS.values())
     with pytest.raises(UserError, match="unknown preset"):

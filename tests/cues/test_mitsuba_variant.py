@@ -24,6 +24,22 @@ def test_a_missing_library_has_no_version() -> None:
     assert mitsuba_variant._llvm_version("libnothing-of-the-kind.so") is None
 
 
+@pytest.mark.parametrize("traces_rays", [True, False])
+def test_a_gpu_is_taken_where_it_traces_rays(monkeypatch: pytest.MonkeyPatch, traces_rays: bool) -> None:
+    monkeypatch.setattr(mitsuba_variant, "_gpu_traces_rays", lambda: traces_rays)
+    assert (mitsuba_variant.choose_variant("auto") == "cuda_ad_rgb") == traces_rays
+    assert mitsuba_variant.choose_variant("cpu") != "cuda_ad_rgb", "the CPU was asked for"
+
+
+def test_a_gpu_without_optix_traces_no_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mitsuba_variant.torch.cuda, "is_available", lambda: True)
+    for library, traces_rays in (("libc.so.6", True), ("libnothing-of-the-kind.so", False)):
+        monkeypatch.setattr(mitsuba_variant, "_OPTIX", library)
+        mitsuba_variant._gpu_traces_rays.cache_clear()
+        assert mitsuba_variant._gpu_traces_rays() == traces_rays
+    mitsuba_variant._gpu_traces_rays.cache_clear()
+
+
 def test_devices() -> None:
     assert mitsuba_variant.choose_variant("cuda") == "cuda_ad_rgb"
     with pytest.raises(UserError, match="tpu"):

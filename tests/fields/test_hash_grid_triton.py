@@ -1,6 +1,7 @@
 """The Triton kernels against the readable twin in float64, by Triton's interpreter where there is no GPU."""
 
 import importlib.util
+import inspect
 import os
 import subprocess
 import sys
@@ -130,3 +131,39 @@ def test_without_triton_the_twin_is_used_and_said_so(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert hash_grid._gpu_kernel.__wrapped__(torch.device("cuda")) is None
     assert "pip install triton" in capsys.readouterr().err
+
+
+_COMPILE = """
+import itertools, sys
+import illuminerf
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource, compile
+from illuminerf.fields import hash_grid_triton as kernels
+kinds = [("fp32", 2, True), ("fp32", 2, False), ("fp32", 3, True), ("fp32", 4, True), ("fp64", 2, True)]
+for kernel, (dtype, features, jacobian) in itertools.product((kernels._forward, kernels._backward), kinds):
+    padded, block = 2 * -(-features // 2), 100 if sys.argv[1] == "spoilt" else 128
+    constants = {"num_features": features, "padded": padded, "with_jacobian": jacobian, "block": block}
+    types = dict.fromkeys(kernel.arg_names, "*" + dtype) | {"levels": "*i32"} | dict.fromkeys(constants, "constexpr")
+    types |= {name: "i32" for name in types if name == "num_points" or name.endswith("stride")}
+    places = {(kernel.arg_names.index(name),): value for name, value in constants.items()}
+    compiled = compile(ASTSource(kernel, types, places), target=GPUTarget("cuda", 90, 32), options=kernels._OPTIONS)
+    assert len(compiled.asm["cubin"]) > 1000
+print("compiled")
+"""
+
+
+@needs_triton
+@pytest.mark.parametrize("state", ["good", "spoilt"])
+def test_kernels_compile_for_a_gpu_that_is_not_here(tmp_path: Path, state: str) -> None:
+    """The interpreter takes more than the compiler does. Spoilt: blocks that are no power of two."""
+    from triton.compiler import ASTSource
+
+    if "constexprs" not in inspect.signature(ASTSource).parameters:
+        pytest.skip("this triton compiles by another interface")
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "TRITON_CACHE_DIR": str(tmp_path)}
+    environment.pop("TRITON_INTERPRET", None)
+    (tmp_path / "compile_all.py").write_text(_COMPILE)  # triton reads the source of kernels from files
+    command = [sys.executable, str(tmp_path / "compile_all.py"), state]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert ("compiled" in done.stdout) == (state == "good"), done.stderr[-3000:]
+    assert state == "good" or "power of 2" in done.stderr

@@ -8,12 +8,15 @@ import os
 from pathlib import Path
 from types import ModuleType
 
+import torch
+
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import say
 
 # With LLVM 14 to 16 the `principled` material aborts the process ("Cannot select: fminimum").
 _OLDEST_LLVM = 19
 _NEWEST_LLVM = 24
+_OPTIX = "libnvoptix.so.1"
 _chosen: list[str] = []
 
 
@@ -43,13 +46,26 @@ def _llvm_version(library: str) -> int | None:
     return int(major.value)
 
 
+@functools.cache
+def _gpu_traces_rays() -> bool:
+    """Whether there is a GPU, and OptiX, which comes with NVIDIA's driver."""
+    if not torch.cuda.is_available():
+        return False
+    try:
+        ctypes.CDLL(_OPTIX)
+    except OSError:
+        return False
+    return True
+
+
 def choose_variant(device: str = "auto") -> str:
-    """The Mitsuba variant for a device: "cuda" -> cuda_ad_rgb; "auto" and "cpu" -> llvm_ad_rgb or scalar_rgb.
+    """The Mitsuba variant for a device: cuda_ad_rgb for "cuda", and for "auto" where a GPU can trace rays; else
+    llvm_ad_rgb or scalar_rgb.
 
     Raises:
         UserError: the device is not one of auto, cpu, cuda.
     """
-    if device == "cuda":
+    if device == "cuda" or (device == "auto" and _gpu_traces_rays()):
         return "cuda_ad_rgb"
     if device not in ("auto", "cpu"):
         raise UserError("no such device for the path tracer", got=device, wanted="auto, cpu or cuda")

@@ -13,6 +13,7 @@ Whoever finds every sample in place seals the artefact.
 
 import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -185,9 +186,13 @@ def _relight(
         config.samples_at_once,
         exposure,
     )
-    for view, samples in zip(batch, relit, strict=True):
-        for sample, image in enumerate(samples):
-            write_png(sample_path(out, view, sample), image.permute(1, 2, 0).cpu().numpy())
+    images = {
+        sample_path(out, view, sample): image.permute(1, 2, 0).cpu().numpy()
+        for view, samples in zip(batch, relit, strict=True)
+        for sample, image in enumerate(samples)
+    }
+    with ThreadPoolExecutor() as threads:  # on a GPU it takes longer to compress a picture than to make it
+        list(threads.map(write_png, images.keys(), images.values()))
 
 
 def exposure_for(num_views: int, cues: Path) -> float:
