@@ -65,6 +65,7 @@ ABLATIONS: dict[str, Ablation] = {
     "sphere_start": _with_losses(starts_from_hull=False),
     "black_background": _with_losses(random_background=False),
     "even_rays": _with_losses(guided_share=0.0),
+    "zero_level": lambda config: replace(config, outlines_set_level=False),
 }
 """What each changes of a geometry's settings: one thing."""
 

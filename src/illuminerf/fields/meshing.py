@@ -25,8 +25,9 @@ def extract_mesh(
     resolution: int,
     min_component_share: float = 0.01,
     observed: OccupiedCells | None = None,
+    level: float = 0.0,
 ) -> TriangleMesh:
-    """Marching cubes at zero, with predicted normals as vertex normals.
+    """Marching cubes, with predicted normals as vertex normals.
 
     Args:
         surface: the fitted surface.
@@ -34,9 +35,10 @@ def extract_mesh(
         resolution: points per axis over the box of the occupied cells.
         min_component_share: connected components smaller than this share of the largest one's area are dropped.
         observed: components without a vertex in these cells are dropped too.
+        level: the signed distance that counts as the surface (see `outline_level`).
 
     Raises:
-        EmptySurface: the distance has no zero crossing.
+        EmptySurface: the distance does not cross the level.
     """
     side = cells.cells.shape[0]
     device = cells.cells.device
@@ -48,17 +50,17 @@ def extract_mesh(
     spacing = float((high - low).max()) / (resolution - 1)
     axes = [torch.arange(low[i], high[i] + spacing, spacing, device=device, dtype=torch.float32) for i in range(3)]
     shape = tuple(len(axis) for axis in axes)
-    distance = torch.full((shape[0] * shape[1] * shape[2],), spacing, device=device)
+    distance = torch.full((shape[0] * shape[1] * shape[2],), level + spacing, device=device)
     for chunk in torch.arange(len(distance), device=device).split(_CHUNK):
         index = (chunk // (shape[1] * shape[2]), chunk // shape[2] % shape[1], chunk % shape[2])
         positions = torch.stack([axis[i] for axis, i in zip(axes, index, strict=True)], -1)
         inside = cells.contains(positions) & (positions.norm(dim=-1) < 1)
         distance[chunk[inside]] = surface.signed_distance(positions[inside])
     volume = distance.view(shape).cpu().numpy()
-    if volume.min() >= 0 or volume.max() <= 0:
+    if volume.min() >= level or volume.max() <= level:
         raise _empty()
     # inside is below outside, and faces come out counter-clockwise seen from outside (held by a test)
-    vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(spacing,) * 3, gradient_direction="descent")
+    vertices, faces, _, _ = marching_cubes(volume, level, spacing=(spacing,) * 3, gradient_direction="descent")
     vertices = vertices + low
     if observed is not None:
         is_seen = observed.contains(torch.from_numpy(vertices.astype(np.float32)).to(device)).cpu().numpy()

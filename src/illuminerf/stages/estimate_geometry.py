@@ -18,6 +18,7 @@ from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss, st
 from illuminerf.fields.image_rendering import observed_cells, render_image
 from illuminerf.fields.meshing import extract_mesh
 from illuminerf.fields.optimisation import OptimiserConfig, fit
+from illuminerf.fields.outlines import outline_level
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
 from illuminerf.fields.ray_guide import RayGuide
 from illuminerf.fields.ray_pool import gather_rays
@@ -31,6 +32,7 @@ from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.processes import Team, join, open_together
 from illuminerf.workflow.progress import say
 
+_OUTLINE_VIEWS = 12
 _GUIDED_FROM = 0.1  # share of the fit; before, errors are everywhere
 
 
@@ -48,6 +50,9 @@ class Config:
     """Cells per axis of the grid that says where the object can be."""
     mesh_resolution: int = 160
     """Points per axis of marching cubes, over the object's box."""
+    outlines_set_level: bool = True
+    """The mesh is taken where its outlines are those of the photographs (see `outline_level`). False: at zero, as in
+    UniSDF, for comparison."""
     min_component_share: float = 0.01
     """Mesh components below this share of the largest one's area are dropped."""
     num_held_out_views: int = 2
@@ -103,14 +108,18 @@ def run(capture_path: Path, config: Config, out: Path) -> Path:
         cells = observed_cells(radiance_field, near_surface, views.cameras)
         save_field(out, StoredField(radiance_field, cells))
         # unobserved parts of observed components stay: they close the mesh against light from behind
+        level = 0.0
+        if config.outlines_set_level and bool(near_surface.cells.any()):
+            level = _level(radiance_field, near_surface, views, fitted, has_masks, config.seed)
         mesh = extract_mesh(
-            radiance_field.surface, near_surface, config.mesh_resolution, config.min_component_share, cells
+            radiance_field.surface, near_surface, config.mesh_resolution, config.min_component_share, cells, level
         )
         mesh.save_glb(out / "mesh.glb")
         shell = surface_shell(radiance_field.surface, cells)
         _save_previews(radiance_field, shell, views, config.num_previews, out / "normals")
         scores = [_psnr(radiance_field, shell, views, view) for view in held_out]
         metrics = {"fit_seconds": round(fit_seconds, 2), "beta": float(radiance_field.surface.beta.detach())}
+        metrics["mesh_level"] = level
         metrics |= {"num_faces": len(mesh.faces)}
         if scores:
             metrics["held_out_psnr"] = float(np.mean(scores))
@@ -171,6 +180,20 @@ def _bounds(views: Views, has_masks: bool, side: int, device: torch.device) -> O
     if not has_masks:
         return OccupiedCells(torch.ones(side, side, side, dtype=torch.bool, device=device))
     return OccupiedCells(visual_hull(views.cameras, views.alphas(), side).to(device)).dilated(1)
+
+
+def _level(
+    radiance_field: RadianceField,
+    near_surface: OccupiedCells,
+    views: Views,
+    fitted: list[int],
+    has_masks: bool,
+    seed: int,
+) -> float:
+    chosen = [fitted[i] for i in np.unique(np.linspace(0, len(fitted) - 1, _OUTLINE_VIEWS).round().astype(int))]
+    device = near_surface.cells.device
+    pool = gather_rays(views.cameras[chosen], views.alphas(chosen), near_surface, device, 0.5)
+    return outline_level(radiance_field, pool, has_masks, torch_generator(seed, "outlines", device=device))
 
 
 def _split(num_views: int, num_held_out: int) -> tuple[list[int], list[int]]:
