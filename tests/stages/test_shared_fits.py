@@ -71,7 +71,8 @@ def test_two_processes_find_what_one_finds(two: Path, one: tuple[Path, dict[str,
         again = GEOMETRY.optimiser.checkpoint_every
         assert curve[again] == curve[STOPS_AT]
         del curve[again]
-    assert curve == pytest.approx(losses[stage], rel=2e-6)
+    # rounding of one step is 2e-7 and grows from step to step: up to 1.1e-5 after seven, over six seeds
+    assert curve == pytest.approx(losses[stage], rel=2e-5)
     assert furthest(two / stage, alone / stage) < 2e-5
     verify(two / stage)
     assert not (two / stage / "checkpoint.safetensors").exists()

@@ -12,7 +12,7 @@ from typing import Any
 
 from illuminerf.workflow.errors import UserError
 
-SCHEMA = 3
+SCHEMA = 4
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,8 @@ class NewField:
 _NEW_FIELDS = (
     NewField(2, "render_radiance_cues", "shard", ""),
     NewField(3, "estimate_geometry", "losses.random_background", False),
+    NewField(4, "estimate_geometry", "losses.guided_share", 0.0),
+    NewField(4, "estimate_geometry", "outlines_set_level", False),
 )
 
 
