@@ -119,8 +119,7 @@ def run(capture_path: Path, config: Config, out: Path) -> Path:
         _save_previews(radiance_field, shell, views, config.num_previews, out / "normals")
         scores = [_psnr(radiance_field, shell, views, view) for view in held_out]
         metrics = {"fit_seconds": round(fit_seconds, 2), "beta": float(radiance_field.surface.beta.detach())}
-        metrics["mesh_level"] = level
-        metrics |= {"num_faces": len(mesh.faces)}
+        metrics |= {"mesh_level": level, "num_faces": len(mesh.faces)}
         if scores:
             metrics["held_out_psnr"] = float(np.mean(scores))
             say(f"geometry: held-out views reach {np.mean(scores):.2f} dB PSNR")
@@ -150,13 +149,16 @@ def _fit(
     pool = gather_rays(views.cameras[fitted], views.alphas(fitted), hull, device)
     srgb = pool.values(views.premultiplied(fitted))
     alpha = pool.values(views.alphas(fitted)) if has_masks else None
-    guide = RayGuide(pool)
+    guide = RayGuide(pool) if config.losses.guided_share else None
 
     def step_loss(step: int) -> tuple[torch.Tensor, dict[str, float]]:
         generator = torch_generator(config.seed, "geometry", step, device=device)
         progress, rays = step / config.optimiser.num_steps, config.optimiser.rays_per_step
-        num_guided = round(rays * config.losses.guided_share) if progress >= _GUIDED_FROM else 0
-        index = torch.cat([pool.draw(rays - num_guided, generator), guide.draw(num_guided, generator)])
+        if guide is None or progress < _GUIDED_FROM:
+            index = pool.draw(rays, generator)
+        else:
+            num_guided = round(rays * config.losses.guided_share)
+            index = torch.cat([pool.draw(rays - num_guided, generator), guide.draw(num_guided, generator)])
         return geometry_loss(radiance_field, config.losses, pool, srgb, alpha, index, progress, generator, team, guide)
 
     def start() -> None:
@@ -172,7 +174,7 @@ def _fit(
             "fit geometry",
             start,
             team,
-            {"ray_errors": guide.errors},
+            {} if guide is None else {"ray_errors": guide.errors},
         )
 
 
