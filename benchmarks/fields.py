@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from illuminerf.fields.bounds import OccupiedCells, ball_interval
-from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss
+from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss, level_weights
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig, interpolate
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
 from illuminerf.fields.ray_pool import RayPool, gather_rays
@@ -76,11 +76,13 @@ def fits(config: FieldConfig, num_rays: int, seconds: float, device: torch.devic
     pool = sphere_pool(device, 128)
     srgb = torch.full((len(pool), 3), 0.5, device=device)
     alpha = (torch.arange(len(pool), device=device) < pool.num_foreground).float()
+    losses = GeometryLossConfig()
+    levels = level_weights(field, losses, 1.0, device)
 
     def geometry(number: int) -> Tensor:
         generator = torch_generator(0, number, device=device)
         index = pool.draw(num_rays, generator)
-        loss, _ = geometry_loss(field, GeometryLossConfig(), pool, srgb, alpha, index, 1.0, generator)
+        loss, _ = geometry_loss(field, losses, pool, srgb, alpha, index, levels, generator)
         return loss
 
     spent = seconds_per_call(training_step(list(field.parameters()), geometry), seconds, device)

@@ -30,10 +30,14 @@ from unittest import mock
 import torch
 from torch import Tensor
 
-from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss
+from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_steps
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
+from illuminerf.fields.optimisation import OptimiserConfig, Stepper
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
+from illuminerf.fields.ray_guide import RayGuide
+from illuminerf.fields.recorded_steps import RecordableLoss
 from illuminerf.fields.shading_cache import cache_shading, latent_loss
+from illuminerf.fields.shading_slots import ShadingSlots
 from illuminerf.workflow.device import Precision, resolve_device, torch_generator
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import track
@@ -45,13 +49,12 @@ from benchmarks.fields import (  # noqa: E402
     readable,
     sphere_pool,
     surface_against_twin,
-    training_step,
 )
 from benchmarks.gpu import check_kernels  # noqa: E402
 from benchmarks.gpu.method import ceilings, geometry_work, small_field  # noqa: E402
 
 _STEPS, _GOAL_MINUTES, _PLAIN_STEPS, _CALLS, _KEPT, _IMAGES = 25_000, 5.0, 20, 10, 16, 1600
-Step = Callable[[int], None]
+Step = Callable[[int], object]
 
 
 def main() -> None:
@@ -187,68 +190,79 @@ def fits(
     pool = sphere_pool(device, 64 if steps < 10 else 256)
     srgb = torch.full((len(pool), 3), 0.5, device=device)
     alpha = (torch.arange(len(pool), device=device) < pool.num_foreground).float()
-    last = {"loss": 0.0}
+    # all hash levels are on and rays are guided, as in most steps of a fit
+    optimiser, losses = OptimiserConfig(num_steps=1, rays_per_step=rays), GeometryLossConfig()
+    guide = RayGuide(pool)
 
-    def geometry(number: int) -> Tensor:
-        generator = torch_generator(0, number, device=device)
-        index = pool.draw(rays, generator)
-        loss, _ = geometry_loss(field, GeometryLossConfig(), pool, srgb, alpha, index, 1.0, generator)
-        last["loss"] = float(loss.detach())  # as `fit` does: it looks at every loss
-        return loss
+    def geometry() -> RecordableLoss:
+        return geometry_steps(field, losses, optimiser, pool, srgb, alpha, guide, 0)
 
-    step = training_step(list(field.parameters()), geometry)
-    of_geometry = speeds("geometry", step, field, steps, device, is_profiled) | last
+    of_geometry = speeds("geometry", list(field.parameters()), geometry, field, optimiser, steps, is_profiled)
 
     covered = pool.foreground_subset(1 << 18, torch_generator(0, "pixels", device=device))
     cache = cache_shading(field, covered, _KEPT)
     codes = torch.nn.Parameter(torch.zeros(_IMAGES, config.appearance.latent_width, device=device))
 
-    def latent(number: int) -> Tensor:
-        generator = torch_generator(1, number, device=device)
-        index, image = (
-            torch.randint(size, (rays,), generator=generator, device=device) for size in (len(covered), _IMAGES)
-        )
-        within = torch.rand(rays, 2, generator=generator, device=device) - 0.5
-        latents = torch.nn.functional.embedding(image, codes)
-        loss, _ = latent_loss(field, cache, index, srgb[index], latents, 1e-4, within)
-        last["loss"] = float(loss.detach())
-        return loss
+    def latent_nerf() -> RecordableLoss:
+        slots, generator = ShadingSlots(), torch.Generator(device)
 
-    step = training_step([*field.appearance.parameters(), codes], latent)
-    return of_geometry, speeds("latent NeRF", step, field, steps, device, is_profiled) | last
+        def loss() -> tuple[Tensor, dict[str, Tensor]]:
+            index, image = (
+                torch.randint(size, (rays,), generator=generator, device=device) for size in (len(covered), _IMAGES)
+            )
+            within = torch.rand(rays, 2, generator=generator, device=device) - 0.5
+            latents = codes.index_select(0, image)
+            return latent_loss(field, cache, index, srgb[index], latents, 1e-4, within, slots=slots)
+
+        return RecordableLoss(lambda step: generator.manual_seed(step).device, loss, generator, rays * _KEPT, slots)
+
+    parameters = [*field.appearance.parameters(), codes]
+    return of_geometry, speeds("latent NeRF", parameters, latent_nerf, field, optimiser, steps, is_profiled)
 
 
 def speeds(
-    name: str, step: Step, field: RadianceField, steps: int, device: torch.device, is_profiled: bool
+    name: str,
+    parameters: list[torch.nn.Parameter],
+    loss: Callable[[], RecordableLoss],
+    field: RadianceField,
+    optimiser: OptimiserConfig,
+    steps: int,
+    is_profiled: bool,
 ) -> dict[str, Any]:
     """Steps per second by what computes, minutes for the paper's steps, peak memory, and what takes the time."""
-    ways: list[tuple[str, Precision, int]] = [
-        ("float32_plain_torch", "float32", min(steps, _PLAIN_STEPS)),
-        ("float32", "float32", steps),
-        ("bfloat16", "bfloat16", steps),
+    device = parameters[0].device
+    ways: list[tuple[str, Precision, bool, int]] = [
+        ("float32_plain_torch", "float32", False, min(steps, _PLAIN_STEPS)),
+        ("float32_not_recorded", "float32", False, min(steps, _PLAIN_STEPS)),
+        ("float32", "float32", True, steps),
+        ("bfloat16_not_recorded", "bfloat16", False, min(steps, _PLAIN_STEPS)),
+        ("bfloat16", "bfloat16", True, steps),
     ]
-    rates, peaks = {}, {}
-    for way, precision, count in ways:
+    rates, peaks, numbers = {}, {}, {"loss": math.nan}
+    for way, precision, records, count in ways:
         if device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(device)
         with field.computing_in(precision), in_plain_torch() if way.endswith("plain_torch") else nullcontext():
-            for number in range(3):
-                step(number)
+            stepper = Stepper(parameters, optimiser, loss(), records=records)
+            for number in range(6):  # slots settle, and a step is recorded
+                stepper.step(number)
             _wait(device)
             start = time.perf_counter()
-            for number in track(range(count), f"{name}, {way}"):
-                step(number)
+            for number in track(range(6, 6 + count), f"{name}, {way}"):
+                numbers = stepper.step(number)
             _wait(device)
             rates[way] = count / (time.perf_counter() - start)
+            del stepper
         if device.type == "cuda":
             peaks[way] = torch.cuda.max_memory_allocated(device) / 1e9
     minutes = {way: _STEPS / rate / 60 for way, rate in rates.items()}
     result = {"timed_steps": steps, "steps_per_second": rates, "minutes": minutes, "device_memory_gb": peaks}
-    result["kernels_over_plain_torch"] = rates["float32"] / rates["float32_plain_torch"]
+    result["over_plain_torch"] = rates["float32"] / rates["float32_plain_torch"]
     if is_profiled:
         with field.computing_in("bfloat16"):
-            result["ms_by_kernel"] = _profile(step, device)
-    return result
+            stepper = Stepper(parameters, optimiser, loss(), records=False)
+            result["ms_by_kernel"] = _profile(stepper.step, device)
+    return result | {"loss": numbers["loss"]}
 
 
 def _profile(step: Step, device: torch.device, num_steps: int = 5) -> dict[str, float]:

@@ -5,13 +5,19 @@ import dataclasses
 import pytest
 import torch
 
+from benchmarks.fields import sphere_pool
 from illuminerf.diffusion.sampling import sample_relit
 from illuminerf.fields.bounds import OccupiedCells
+from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_steps
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
 from illuminerf.fields.image_rendering import render_image
+from illuminerf.fields.optimisation import OptimiserConfig, Stepper
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
+from illuminerf.fields.ray_guide import RayGuide
 from illuminerf.fields.shell import surface_shell
+from illuminerf.fields.step_draws import StepDraws
 from illuminerf.scene.cameras import turntable_cameras
+from illuminerf.workflow.device import Precision
 from tests.diffusion.tiny import random_condition_inputs, tiny_model, with_noise_in_every_weight
 
 pytestmark = [
@@ -73,3 +79,29 @@ def test_samples_of_a_relighting_model() -> None:
     torch.testing.assert_close(on_gpu, on_cpu, rtol=0, atol=0.02)
     other = sample_relit(model, image.cuda(), cues.cuda(), [[2], [3]], 2).cpu()
     assert (other - on_cpu).abs().max() > 0.05, "other seeds must give other samples"
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_recorded_steps_are_the_steps(
+    precision: Precision, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # of this noise there is as much as slots, so that what is drawn after it depends on their number
+    monkeypatch.setattr(StepDraws, "normal", lambda draws, *shape: torch.zeros(*shape, device="cuda"))
+    results = []
+    for records, seed in ((True, 0), (False, 0), (False, 1)):
+        torch.manual_seed(seed)
+        field = RadianceField(FieldConfig.embedded()).to("cuda")
+        pool = sphere_pool(torch.device("cuda"), 48)
+        target = torch.full((len(pool), 3), 0.5, device="cuda")
+        alpha = (torch.arange(len(pool), device="cuda") < pool.num_foreground).float()
+        optimiser = OptimiserConfig(num_steps=30, rays_per_step=512, warmup_steps=3)
+        steps = geometry_steps(field, GeometryLossConfig(), optimiser, pool, target, alpha, RayGuide(pool), seed)
+        stepper = Stepper(field.parameters(), optimiser, steps, records=records)
+        with field.computing_in(precision):
+            results.append([stepper.step(step)["loss"] for step in range(30)])
+    recorded, launched, other = results
+    assert recorded[:8] == pytest.approx(launched[:8], rel=1e-4)
+    assert recorded == pytest.approx(launched, rel=0.02), "atomics add in any order, and differences grow"
+    # the guard: other seeds have other losses from the start
+    assert other[:8] != pytest.approx(launched[:8], rel=1e-4)
+    assert "cannot be recorded" not in capsys.readouterr().err

@@ -26,7 +26,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from illuminerf import pipeline
 from illuminerf.diffusion.pretrained import pretrained_model
-from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss
+from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss, level_weights
 from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
 from illuminerf.presets import PRESETS, Preset, customised
@@ -71,8 +71,10 @@ def geometry_work(config: FieldConfig, num_rays: int, device: torch.device) -> d
         torch.cuda.reset_peak_memory_stats()
     alpha = (torch.arange(len(pool), device=device) < pool.num_foreground).float()
     srgb = torch.full((len(pool), 3), 0.5, device=device)
+    losses = GeometryLossConfig()
+    levels = level_weights(field, losses, 1.0, device)
     with FlopCounterMode(display=False) as counter:
-        loss, _ = geometry_loss(field, GeometryLossConfig(), pool, srgb, alpha, index, 1.0, generator)
+        loss, _ = geometry_loss(field, losses, pool, srgb, alpha, index, levels, generator)
         loss.backward()
     weights = sum(parameter.numel() for parameter in field.parameters())
     peak = torch.cuda.max_memory_allocated() / 1e9 if device.type == "cuda" else 0.0

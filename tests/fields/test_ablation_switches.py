@@ -6,7 +6,7 @@ import torch
 
 from illuminerf.fields.appearance import AppearanceConfig, AppearanceField, blend_radiance
 from illuminerf.fields.bounds import OccupiedCells
-from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss
+from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss, level_weights
 from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.proposal_sampling import ProposalConfig, interlevel_loss
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
@@ -91,7 +91,8 @@ def test_every_kind_can_be_fitted_stored_and_loaded(part: str, tmp_path) -> None
     generator = torch.Generator().manual_seed(0)
     index = pool.draw(16, generator)
     target = torch.rand(len(pool), 3, generator=generator)
-    loss, _ = geometry_loss(field, GeometryLossConfig(first_levels=1), pool, target, None, index, 0.3, generator)
+    config = GeometryLossConfig(first_levels=1)
+    loss, _ = geometry_loss(field, config, pool, target, None, index, level_weights(field, config, 0.3), generator)
     loss.backward()
     unused = {"appearance.glo.mlp.0.weight", "appearance.glo.mlp.2.weight"}
     assert {name for name, p in field.named_parameters() if p.grad is None} == unused
@@ -109,7 +110,8 @@ def test_without_coarse_to_fine_all_levels_are_on_from_the_second_step() -> None
     def learns_finest_level(share: float, progress: float) -> bool:
         field, generator = field_with("default"), torch.Generator().manual_seed(0)
         config = GeometryLossConfig(first_levels=1, coarse_to_fine_share=share)
-        geometry_loss(field, config, pool, target, None, index, progress, generator)[0].backward()
+        levels = level_weights(field, config, progress)
+        geometry_loss(field, config, pool, target, None, index, levels, generator)[0].backward()
         grid = field.surface.grid
         assert grid.table.grad is not None
         return bool(grid.table.grad[int(grid.layout[-1, 2]) :].any())

@@ -75,4 +75,4 @@ def test_an_opaque_ray_before_the_background_still_gets_a_gradient() -> None:
 
 
 def test_psnr() -> None:
-    assert losses.psnr(0.01) == pytest.approx(20.0)
+    assert float(losses.psnr(torch.tensor(0.01))) == pytest.approx(20.0)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss
+from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss, level_weights
 from illuminerf.fields.optimisation import OptimiserConfig
 from illuminerf.fields.radiance_field import RadianceField
 from illuminerf.workflow.config import from_json, to_json
@@ -23,7 +23,9 @@ def _loss(field: RadianceField) -> Tensor:
     target, alpha = torch.full((40, 3), 0.5), torch.ones(40)
     generator = torch.Generator().manual_seed(1)
     index = torch.arange(40)
-    return geometry_loss(field, GeometryLossConfig(first_levels=2), pool, target, alpha, index, 1.0, generator)[0]
+    config = GeometryLossConfig(first_levels=2)
+    levels = level_weights(field, config, 1.0)
+    return geometry_loss(field, config, pool, target, alpha, index, levels, generator)[0]
 
 
 def _by_precision(ask: Callable[[RadianceField], Tensor]) -> tuple[Tensor, Tensor]:

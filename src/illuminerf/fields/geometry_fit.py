@@ -1,6 +1,7 @@
 """Geometry estimation: the loss of one step, and the start from the visual hull."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -9,15 +10,19 @@ from torch import Tensor
 from illuminerf.fields import losses
 from illuminerf.fields.bounds import OccupiedCells, signed_distance_of_cells
 from illuminerf.fields.hash_grid import coarse_to_fine_weights
+from illuminerf.fields.optimisation import OptimiserConfig
 from illuminerf.fields.proposal_sampling import interlevel_loss
 from illuminerf.fields.radiance_field import RadianceField
 from illuminerf.fields.ray_guide import RayGuide
 from illuminerf.fields.ray_pool import RayPool
+from illuminerf.fields.recorded_steps import RecordableLoss
+from illuminerf.fields.shading_slots import ShadingSlots
 from illuminerf.fields.step_draws import StepDraws
-from illuminerf.workflow.device import torch_generator
+from illuminerf.workflow.device import derived_seed, torch_generator
 from illuminerf.workflow.processes import ALONE, Team
 
 _HULL_MARGIN_CELLS = 1.9
+_GUIDED_FROM = 0.1  # share of the fit; before, errors are everywhere
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,22 @@ class GeometryLossConfig:
     A.1), for comparison."""
 
 
+class LevelWeights(NamedTuple):
+    """Weights of hash levels, coarse to fine."""
+
+    distance: Float[Tensor, " levels"]
+    normals: Float[Tensor, " normal_levels"]
+
+
+def level_weights(
+    field: RadianceField, config: GeometryLossConfig, progress: float, device: torch.device | str = "cpu"
+) -> LevelWeights:
+    """Those of the share of the fit that is over."""
+    phase, first = progress / max(config.coarse_to_fine_share, 1e-6), config.first_levels
+    levels = field.config.surface.grid.num_levels, field.surface.num_normal_levels
+    return LevelWeights(*(coarse_to_fine_weights(count, phase, first, device) for count in levels))
+
+
 def geometry_loss(
     field: RadianceField,
     config: GeometryLossConfig,
@@ -58,38 +79,36 @@ def geometry_loss(
     target_srgb: Float[Tensor, "pool 3"],
     target_alpha: Float[Tensor, " pool"] | None,
     index: Tensor,
-    progress: float,
+    levels: LevelWeights,
     generator: torch.Generator,
     team: Team = ALONE,
     guide: RayGuide | None = None,
-) -> tuple[Tensor, dict[str, float]]:
+    slots: ShadingSlots | None = None,
+) -> tuple[Tensor, dict[str, Tensor]]:
     """Loss of one batch of rays, or of the share of it that is this process's, with numbers to show.
 
     Args:
         target_srgb: premultiplied on black, of every ray of the pool.
         target_alpha: coverage; None where the capture has no masks.
         index: the rays of this batch, all processes' together.
-        progress: share of the fit that is over.
+        levels: see `level_weights`.
         guide: takes in the rays' errors.
+        slots: of the samples that are shaded.
     """
     draws = StepDraws(generator, len(index), team)
     batch, all_rays, index = len(index), index, index[draws.own]
-    device = index.device
     origins, directions, near, far = pool.rays(index)
-    phase = progress / max(config.coarse_to_fine_share, 1e-6)
-    grids = field.config.surface
-    levels = coarse_to_fine_weights(grids.grid.num_levels, phase, config.first_levels, device)
-    normal_levels = coarse_to_fine_weights(field.surface.num_normal_levels, phase, config.first_levels, device)
 
-    samples = field.sample(origins, directions, near, far, draws, levels)
-    points = field.worth_shading(samples)
-    predicted, shading = field.shading_normals(points, normal_levels)
+    slots = slots or ShadingSlots()
+    samples = field.sample(origins, directions, near, far, draws, levels.distance)
+    points = field.worth_shading(samples, slots)
+    predicted, shading = field.shading_normals(points, levels.normals)
     srgb = field.shade(points, shading, directions)
 
     noise = draws.normal(len(points.positions), 3) * config.smoothness_sigma
-    perturbed = field.surface.predicted_normals(points.positions + noise, normal_levels)
+    perturbed = field.surface.predicted_normals(points.positions + noise, levels.normals)
     anywhere = draws.uniform(3) * 1.6 - 0.8
-    gradients = torch.cat([samples.end_gradients.view(-1, 3), field.surface(anywhere, levels).gradient])
+    gradients = torch.cat([samples.end_gradients.view(-1, 3), field.surface(anywhere, levels.distance).gradient])
 
     wanted = target_srgb[index]
     if target_alpha is not None and config.random_background:
@@ -100,7 +119,7 @@ def geometry_loss(
     # Charbonnier as in camp_zipnerf: against the squared error's ever smaller gradient the smoothness terms win
     squared = losses.colour_loss(srgb.detach(), wanted)
     if guide is not None:
-        guide.update(all_rays, (srgb.detach() - wanted).abs().mean(-1), team)
+        guide.update(all_rays, (srgb.detach() - wanted).abs().mean(-1), team, slots.overflow)
     total = losses.robust_colour_loss(srgb, wanted) + config.eikonal * losses.eikonal_loss(gradients)
     total = total + interlevel_loss(samples.edges, samples.weights, samples.proposal_edges, samples.proposal_weights)
     rays = len(index)
@@ -113,8 +132,49 @@ def geometry_loss(
     total = total + config.normal_smoothness * losses.normal_smoothness_loss(points.weights, predicted, perturbed, rays)
     if target_alpha is not None:
         total = total + config.mask * losses.mask_loss(samples.depth, target_alpha[index])
-    numbers = {"psnr": losses.psnr(team.mean(squared, batch)), "beta": float(field.surface.beta.detach())}
-    return total, numbers
+    return total, {"psnr": losses.psnr(team.mean(squared, batch)), "beta": field.surface.beta.detach()}
+
+
+def geometry_steps(
+    field: RadianceField,
+    config: GeometryLossConfig,
+    optimiser: OptimiserConfig,
+    pool: RayPool,
+    target_srgb: Float[Tensor, "pool 3"],
+    target_alpha: Float[Tensor, " pool"] | None,
+    guide: RayGuide | None,
+    seed: int,
+    team: Team = ALONE,
+) -> RecordableLoss:
+    """The loss of every step of a fit.
+
+    Args:
+        target_srgb: as of `geometry_loss`, with the next.
+        guide: says where the share of `config` is drawn; None: rays are drawn evenly.
+    """
+    device, rays = pool.view.device, optimiser.rays_per_step
+    generator = torch.Generator(device)
+    levels = level_weights(field, config, 0.0, device)
+    slots, num_guided = ShadingSlots(), 0
+
+    def prepare(step: int) -> int:
+        nonlocal num_guided
+        generator.manual_seed(derived_seed(seed, "geometry", step))
+        progress = step / optimiser.num_steps
+        for weights, now in zip(levels, level_weights(field, config, progress), strict=True):
+            weights.copy_(now)
+        num_guided = 0 if guide is None or progress < _GUIDED_FROM else round(rays * config.guided_share)
+        return num_guided
+
+    def loss() -> tuple[Tensor, dict[str, Tensor]]:
+        index = pool.draw(rays - num_guided, generator)
+        if guide is not None and num_guided:
+            index = torch.cat([index, guide.draw(num_guided, generator)])
+        return geometry_loss(
+            field, config, pool, target_srgb, target_alpha, index, levels, generator, team, guide, slots
+        )
+
+    return RecordableLoss(prepare, loss, generator, rays * field.config.num_samples, slots)
 
 
 def start_from_cells(

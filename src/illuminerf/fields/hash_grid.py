@@ -102,7 +102,7 @@ class HashGrid(nn.Module):
         return kernel.apply(self.table, positions, self.layout, with_jacobian)
 
     def _columns(self, level_weights: Tensor) -> Tensor:
-        return level_weights.to(self.table).repeat_interleave(self.config.num_features)
+        return level_weights.to(self.table)[:, None].expand(-1, self.config.num_features).reshape(-1)
 
 
 @functools.cache

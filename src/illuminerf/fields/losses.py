@@ -85,9 +85,9 @@ def normal_smoothness_loss(
     return (weights * _squared_distance(perturbed_normals, predicted_normals)).sum() / num_rays
 
 
-def psnr(mean_squared_error: Tensor | float) -> float:
-    """Peak signal-to-noise ratio in dB of values in [0, 1]."""
-    return float(-10 * torch.log10(torch.as_tensor(mean_squared_error, dtype=torch.float64).clamp_min(1e-12)))
+def psnr(mean_squared_error: Tensor) -> Float[Tensor, ""]:
+    """Peak signal-to-noise ratio in dB of values in [0, 1], float64."""
+    return -10 * torch.log10(mean_squared_error.double().clamp_min(1e-12))
 
 
 def _squared_distance(first: Tensor, second: Tensor) -> Tensor:

@@ -201,7 +201,7 @@ def appearance_loss(
     target_srgb: Float[Tensor, "pool 3"],
     index: Int[Tensor, " batch"],
     generator: torch.Generator,
-) -> tuple[Tensor, dict[str, float]]:
+) -> tuple[Tensor, dict[str, Tensor]]:
     """Colours of rays, and the proposal that finds the surface: what is left to fit where the surface is known."""
     origins, directions, near, far = pool.rays(index)
     samples = field.sample(origins, directions, near, far, StepDraws(generator, len(index)))

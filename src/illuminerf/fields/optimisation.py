@@ -6,13 +6,14 @@ rounding; with the same number of processes it is the same bytes again (on CPUs)
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from illuminerf.fields.recorded_steps import Numbers, RecordableLoss, RecordedSteps, as_floats
 from illuminerf.workflow.checkpoint import (
     load_checkpoint,
     optimizer_tensors,
@@ -64,10 +65,67 @@ class OptimiserConfig:
         return decayed * 0.5 * (1 - math.cos(math.pi * (step + 1) / (self.warmup_steps + 1)))
 
 
+class Stepper:
+    """Adam on the loss of a step, one step at a time.
+
+    On a GPU, by one process alone, steps of a `RecordableLoss` are recorded and replayed.
+
+    Args:
+        step_loss: see `fit`.
+        records: False launches every step anew, for comparison.
+    """
+
+    def __init__(
+        self,
+        parameters: Iterable[nn.Parameter],
+        config: OptimiserConfig,
+        step_loss: Callable[[int], tuple[Tensor, Numbers]],
+        team: Team = ALONE,
+        records: bool = True,
+    ) -> None:
+        self._parameters, self._config, self._step_loss, self._team = list(parameters), config, step_loss, team
+        device = self._parameters[0].device
+        self._recorded = None
+        if records and device.type == "cuda" and team.is_alone and isinstance(step_loss, RecordableLoss):
+            loss = step_loss.loss
+            self._recorded = RecordedSteps(step_loss, lambda: self._compute(loss), device)
+        # a recording reads the rate from memory
+        rate = torch.zeros((), device=device) if self._recorded else 0.0
+        self.optimiser = torch.optim.Adam(
+            self._parameters, rate, (0.9, 0.99), 1e-15, fused=True, capturable=self._recorded is not None
+        )
+
+    def step(self, step: int) -> dict[str, float]:
+        """Take one step; "loss" over all processes' rays, and the numbers that come with it."""
+        for group in self.optimiser.param_groups:
+            rate = self._config.learning_rate(step)
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+        if self._recorded is not None:
+            return self._recorded(step)
+        numbers = self._compute(lambda: self._step_loss(step))
+        return dict(zip(numbers, as_floats(list(numbers.values())), strict=True))
+
+    def _compute(self, loss_of_step: Callable[[], tuple[Tensor, Numbers]]) -> Numbers:
+        rays, team = self._config.rays_per_step, self._team
+        loss, numbers = loss_of_step()
+        total = team.mean(loss.detach(), rays)
+        self.optimiser.zero_grad(set_to_none=True)
+        (loss if team.is_alone else loss * team.weight(rays)).backward()
+        team.sum_gradients(self._parameters)
+        # Adam leaves everything as it is where a step did not fit its slots
+        overflow = self._step_loss.slots.overflow if isinstance(self._step_loss, RecordableLoss) else None
+        setattr(self.optimiser, "found_inf", overflow)  # noqa: B010 - where torch's fused Adam looks for it
+        self.optimiser.step()
+        return {"loss": total, **numbers}
+
+
 def fit(
     module: nn.Module,
     config: OptimiserConfig,
-    step_loss: Callable[[int], tuple[Tensor, dict[str, float]]],
+    step_loss: Callable[[int], tuple[Tensor, Numbers]],
     checkpoint: Path,
     description: str,
     start: Callable[[], None] | None = None,
@@ -93,31 +151,24 @@ def fit(
         raise UserError("a step needs a ray per process", got=f"{rays} rays, {team.count} processes")
     parameters = {name: p for name, p in module.named_parameters() if p.requires_grad}
     state = state or {}
-    optimiser = torch.optim.Adam(list(parameters.values()), betas=(0.9, 0.99), eps=1e-15, fused=True)
+    stepper = Stepper(parameters.values(), config, step_loss, team)
     first = 0
     if team.agreed(checkpoint.exists()):
-        first = _restore(checkpoint, parameters, optimiser, state)
+        first = _restore(checkpoint, parameters, stepper.optimiser, state)
     elif start is not None:
         start()
     team.start_equal(parameters.values())
     with step_progress(description, config.num_steps, first) as progress:
         for step in range(first, config.num_steps):
-            for group in optimiser.param_groups:
-                group["lr"] = config.learning_rate(step)
-            loss, numbers = step_loss(step)
-            total = float(team.mean(loss.detach(), rays))
-            if not math.isfinite(total):
-                raise FloatingPointError(f"the loss is {total} at step {step} of {description}")
-            optimiser.zero_grad(set_to_none=True)
-            (loss if team.is_alone else loss * team.weight(rays)).backward()
-            team.sum_gradients(parameters.values())
-            optimiser.step()
+            numbers = stepper.step(step)
+            if not math.isfinite(numbers["loss"]):
+                raise FloatingPointError(f"the loss is {numbers['loss']} at step {step} of {description}")
             is_due = (step + 1) % config.checkpoint_every == 0 and step + 1 < config.num_steps
             if is_due and team.is_first:
                 tensors: dict[str, Tensor] = {f"parameter.{name}": p for name, p in parameters.items()}
                 tensors |= {f"state.{name}": tensor for name, tensor in state.items()}
-                save_checkpoint(checkpoint, tensors | optimizer_tensors(optimiser), {"step": step + 1})
-            progress.advance(1, loss=total, **numbers)
+                save_checkpoint(checkpoint, tensors | optimizer_tensors(stepper.optimiser), {"step": step + 1})
+            progress.advance(1, **numbers)
 
 
 def _restore(

@@ -13,6 +13,7 @@ from torch.nn import functional
 from illuminerf.fields.appearance import AppearanceConfig, AppearanceField, blend_radiance
 from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.proposal_sampling import ProposalConfig, ProposalField, resample_edges, uniform_edges
+from illuminerf.fields.shading_slots import ShadingSlots
 from illuminerf.fields.step_draws import StepDraws
 from illuminerf.fields.surface import SurfaceConfig, SurfaceField
 from illuminerf.fields.volume_rendering import rendering_weights
@@ -161,19 +162,23 @@ class RadianceField(nn.Module):
             weights.detach() if proposal_weights is None else proposal_weights,  # the proposal's loss is then 0
         )
 
-    def worth_shading(self, samples: RaySamples) -> ShadingPoints:
+    def worth_shading(self, samples: RaySamples, slots: ShadingSlots | None = None) -> ShadingPoints:
         """Samples above the configured weight.
 
         Deviation: UniSDF shades all. A sample left out counts as black, and the gradient that its colour would send
         to its (negligible) weight is dropped.
+
+        Args:
+            slots: a fixed number of points, where they have a capacity; weights of those that do not count are 0.
         """
-        chosen = (samples.weights.detach() > self.config.min_weight).nonzero()
-        ray, sample = chosen.unbind(-1)
+        chosen, counts = (slots or ShadingSlots()).choose(samples.weights.detach() > self.config.min_weight)
+        weights = samples.weights.reshape(-1).index_select(0, chosen)
+        gradients = samples.gradients.reshape(-1, 3).index_select(0, chosen)
         return ShadingPoints(
-            ray,
-            samples.positions[ray, sample],
-            samples.weights[ray, sample],
-            functional.normalize(samples.gradients[ray, sample], dim=-1, eps=1e-6),
+            chosen // samples.weights.shape[1],
+            samples.positions.reshape(-1, 3).index_select(0, chosen),
+            weights if counts is None else weights * counts,
+            functional.normalize(gradients, dim=-1, eps=1e-6),
         )
 
     def shade(
@@ -189,7 +194,7 @@ class RadianceField(nn.Module):
             points.positions,
             directions[points.ray],
             normals,
-            None if latents is None else latents[points.ray],
+            None if latents is None else latents.index_select(0, points.ray),
             level_weights,
         )
         rendered = torch.zeros(len(directions), 7, device=values.device, dtype=values.dtype)

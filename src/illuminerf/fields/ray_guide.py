@@ -41,12 +41,19 @@ class RayGuide:
         within = torch.rand(num_rays, generator=generator, device=device, dtype=torch.float64) * self._count[tile]
         return self._order[self._first[tile] + within.long().minimum(self._count[tile] - 1)].long()
 
-    def update(self, index: Int[Tensor, " batch"], error: Float[Tensor, " own"], team: Team = ALONE) -> None:
+    def update(
+        self,
+        index: Int[Tensor, " batch"],
+        error: Float[Tensor, " own"],
+        team: Team = ALONE,
+        is_void: Float[Tensor, ""] | None = None,
+    ) -> None:
         """Take in the errors of a step's rays.
 
         Args:
             index: rays of the pool, all processes' together.
             error: of this process's own share of them, 0 to 1.
+            is_void: 1: nothing is taken in, since the step will be done again.
         """
         whole = torch.zeros(len(index), device=error.device)
         whole[team.own(len(index))] = error.detach()
@@ -55,4 +62,5 @@ class RayGuide:
         total = torch.zeros_like(self.errors).index_add_(0, tile, whole)
         count = torch.zeros_like(self.errors).index_add_(0, tile, torch.ones_like(whole))
         mixed = (1 - _NEW_SHARE) * self.errors + _NEW_SHARE * total / count.clamp_min(1)
-        self.errors.copy_(torch.where(count > 0, mixed, self.errors))
+        seen = count > 0 if is_void is None else (count > 0) & (is_void == 0)
+        self.errors.copy_(torch.where(seen, mixed, self.errors))

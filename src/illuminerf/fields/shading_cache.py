@@ -13,6 +13,7 @@ from torch import Tensor
 from illuminerf.fields import losses
 from illuminerf.fields.radiance_field import RadianceField, ShadingPoints
 from illuminerf.fields.ray_pool import RayPool
+from illuminerf.fields.shading_slots import ShadingSlots
 from illuminerf.workflow.processes import ALONE, Team
 from illuminerf.workflow.progress import track
 
@@ -44,6 +45,7 @@ class ShadingCache:
         index: Int[Tensor, " batch"],
         latents: Float[Tensor, "batch latent"] | None = None,
         within_pixels: Float[Tensor, "batch 2"] | None = None,
+        slots: ShadingSlots | None = None,
     ) -> Float[Tensor, "batch 3"]:
         """Colours (premultiplied sRGB) of the chosen rays; differentiable in appearance and latents.
 
@@ -52,13 +54,14 @@ class ShadingCache:
                 points are moved to there along the surface's tangent plane.
         """
         weights, directions = self.weights[index], self.directions[index]
-        ray, kept = (weights > field.config.min_weight).nonzero().unbind(-1)
-        source = index[ray]
+        flat, counts = (slots or ShadingSlots()).choose(weights > field.config.min_weight)
+        ray, kept = flat // weights.shape[1], flat % weights.shape[1]
+        source, weights = index[ray], weights.reshape(-1)[flat]
         positions, normals = self.positions[source, kept], self.normals[source, kept]
         if within_pixels is not None:
             steps = within_pixels * self.pixel_sides[index, None]
             positions = positions + steps_on_surface(steps[ray], directions[ray], normals)
-        points = ShadingPoints(ray, positions, weights[ray, kept], normals)
+        points = ShadingPoints(ray, positions, weights if counts is None else weights * counts, normals)
         return field.shade(points, normals, directions, latents)
 
 
@@ -109,7 +112,7 @@ def steps_on_surface(
         steps: in two directions that a ray is normal to, whichever they are.
     """
     steep = directions[:, 2:].abs() > 0.9
-    other = torch.where(steep, directions.new_tensor([1.0, 0, 0]), directions.new_tensor([0, 0, 1.0]))
+    other = torch.cat([steep, torch.zeros_like(steep), ~steep], -1).to(directions.dtype)
     right = torch.nn.functional.normalize(torch.linalg.cross(directions, other), dim=-1)
     across = steps[:, :1] * right + steps[:, 1:] * torch.linalg.cross(right, directions)
     facing = (directions * normals).sum(-1, keepdim=True).clamp_max(-_LEAST_FACING)
@@ -126,7 +129,8 @@ def latent_loss(
     within_pixels: Float[Tensor, "batch 2"] | None = None,
     team: Team = ALONE,
     batch: int = 0,
-) -> tuple[Tensor, dict[str, float]]:
+    slots: ShadingSlots | None = None,
+) -> tuple[Tensor, dict[str, Tensor]]:
     """Equation 7 of the paper on one batch, or on a process's share of it.
 
     Deviation: a small penalty on the squared latents keeps the zero code, which is rendered at test, in their midst.
@@ -134,8 +138,9 @@ def latent_loss(
     Args:
         within_pixels: see `ShadingCache.render`.
         batch: rays of all processes together.
+        slots: of the samples that are shaded.
     """
-    colour = losses.colour_loss(cache.render(field, index, latents, within_pixels), target_srgb)
+    colour = losses.colour_loss(cache.render(field, index, latents, within_pixels, slots), target_srgb)
     total = colour
     if latents is not None:
         total = total + latent_penalty * latents.square().sum(-1).mean()

@@ -4,7 +4,7 @@ OpenGL axes (x right, y up, looking along -z) in a z-up world; `world_from_camer
 Pixel (column i, row j) has its centre at (i + 0.5, j + 0.5), rows run downward.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ class Cameras:
     intrinsics: np.ndarray
     height: int
     width: int
+    _copies: dict[torch.device, tuple[Tensor, ...]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         poses, intrinsics = self.world_from_camera, self.intrinsics
@@ -86,14 +87,22 @@ class Cameras:
         self, view_index: Int[Tensor, " rays"], pixels_xy: Float[Tensor, "rays 2"]
     ) -> tuple[Float[Tensor, "rays 3"], Float[Tensor, "rays 3"]]:
         """World origins and unit directions of the rays through image points, on the device of the index."""
-        device = view_index.device
-        poses = torch.from_numpy(self.world_from_camera).to(device)[view_index]
-        fx, fy, cx, cy = torch.from_numpy(self.intrinsics).to(device)[view_index].unbind(-1)
+        all_poses, all_intrinsics = self._on(view_index.device)
+        poses = all_poses[view_index]
+        fx, fy, cx, cy = all_intrinsics[view_index].unbind(-1)
         x, y = pixels_xy.double().unbind(-1)
         in_camera = torch.stack([(x - cx) / fx, -(y - cy) / fy, -torch.ones_like(x)], -1)
         directions = torch.einsum("rij,rj->ri", poses[:, :3, :3], in_camera)
         directions = directions / directions.norm(dim=-1, keepdim=True)
         return poses[:, :3, 3].float(), directions.float()
+
+    def _on(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Poses and intrinsics on a device, copied there once."""
+        if device not in self._copies:
+            both = self.world_from_camera, self.intrinsics
+            self._copies[device] = tuple(torch.from_numpy(values).to(device) for values in both)
+        poses, intrinsics = self._copies[device]
+        return poses, intrinsics
 
     def image_rays(self, view: int) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
         """Origins and unit directions of all pixel centres of one view."""

@@ -14,7 +14,7 @@ import torch
 
 from illuminerf.data.capture import load_capture
 from illuminerf.fields.bounds import OccupiedCells, visual_hull
-from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss, start_from_cells
+from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_steps, start_from_cells
 from illuminerf.fields.image_rendering import observed_cells, render_image
 from illuminerf.fields.meshing import extract_mesh
 from illuminerf.fields.optimisation import OptimiserConfig, fit
@@ -33,7 +33,6 @@ from illuminerf.workflow.processes import Team, join, open_together
 from illuminerf.workflow.progress import say
 
 _OUTLINE_VIEWS = 12
-_GUIDED_FROM = 0.1  # share of the fit; before, errors are everywhere
 
 
 @dataclass(frozen=True)
@@ -151,15 +150,7 @@ def _fit(
     alpha = pool.values(views.alphas(fitted)) if has_masks else None
     guide = RayGuide(pool) if config.losses.guided_share else None
 
-    def step_loss(step: int) -> tuple[torch.Tensor, dict[str, float]]:
-        generator = torch_generator(config.seed, "geometry", step, device=device)
-        progress, rays = step / config.optimiser.num_steps, config.optimiser.rays_per_step
-        if guide is None or progress < _GUIDED_FROM:
-            index = pool.draw(rays, generator)
-        else:
-            num_guided = round(rays * config.losses.guided_share)
-            index = torch.cat([pool.draw(rays - num_guided, generator), guide.draw(num_guided, generator)])
-        return geometry_loss(radiance_field, config.losses, pool, srgb, alpha, index, progress, generator, team, guide)
+    steps = geometry_steps(radiance_field, config.losses, config.optimiser, pool, srgb, alpha, guide, config.seed, team)
 
     def start() -> None:
         if config.losses.starts_from_hull:
@@ -169,7 +160,7 @@ def _fit(
         fit(
             radiance_field,
             config.optimiser,
-            step_loss,
+            steps,
             checkpoint,
             "fit geometry",
             start,

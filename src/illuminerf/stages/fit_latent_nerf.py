@@ -12,20 +12,22 @@ from pathlib import Path
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
 from illuminerf.data.capture import load_capture
 from illuminerf.fields.optimisation import OptimiserConfig, fit
 from illuminerf.fields.radiance_field import RadianceField
 from illuminerf.fields.ray_pool import RayPool, gather_rays
+from illuminerf.fields.recorded_steps import RecordableLoss
 from illuminerf.fields.shading_cache import ShadingCache, cache_shading, latent_loss
+from illuminerf.fields.shading_slots import ShadingSlots
 from illuminerf.fields.storage import StoredField, load_field, save_field
 from illuminerf.scene.images import read_png_bytes
-from illuminerf.workflow.device import torch_generator
+from illuminerf.workflow.device import derived_seed, torch_generator
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.processes import Team, join, open_together
 from illuminerf.workflow.progress import track
 
+_RECENT_SHARE = 0.98  # of the running PSNR that stays from step to step
 _LEAST_COVERAGE = 0.5  # below it a pixel says little of the object's colour
 
 
@@ -169,12 +171,15 @@ def _fit(
     each learn the noise of a handful of samples, and unseen views are grainy.
     """
     device = cache.weights.device
-    num_samples, recent, rays = len(targets), [0.0], config.optimiser.rays_per_step
-    own = team.own(rays)
+    num_samples, rays = len(targets), config.optimiser.rays_per_step
+    own, slots, generator = team.own(rays), ShadingSlots(), torch.Generator(device)
     to_opacity = (cache.weights.sum(-1) / coverage.clamp_min(1e-3))[:, None]
+    recent = torch.full((), torch.nan, dtype=torch.float64, device=device)
 
-    def step_loss(step: int) -> tuple[Tensor, dict[str, float]]:
-        generator = torch_generator(config.seed, "latent nerf", step, device=device)
+    def prepare(step: int) -> None:
+        generator.manual_seed(derived_seed(config.seed, "latent nerf", step))
+
+    def loss() -> tuple[Tensor, dict[str, Tensor]]:
         index = torch.randint(pool.num_foreground, (rays,), generator=generator, device=device)[own]
         sample = torch.randint(num_samples, (rays,), generator=generator, device=device)[own]
         target = (targets[sample, index].float() / 255 * to_opacity[index]).clamp_max(1)
@@ -184,17 +189,18 @@ def _fit(
             if config.shuffles_latents:
                 others = torch.randint(max(len(model.latents) - 1, 1), (rays,), generator=generator, device=device)
                 image = (image + 1 + others[own]) % len(model.latents)
-            latents = functional.embedding(image, model.latents)
+            latents = model.latents.index_select(0, image)
         within = torch.rand(rays, 2, generator=generator, device=device)[own] - 0.5
         penalty = config.latent_penalty
-        loss, numbers = latent_loss(radiance_field, cache, index, target, latents, penalty, within, team, rays)
-        share = 0.98 if step else 0.0
-        recent[0] = share * recent[0] + (1 - share) * numbers["psnr"]
-        return loss, {"psnr": recent[0]}
+        total, numbers = latent_loss(radiance_field, cache, index, target, latents, penalty, within, team, rays, slots)
+        found = numbers["psnr"].to(device)
+        recent.copy_(torch.where(recent.isnan(), found, _RECENT_SHARE * recent + (1 - _RECENT_SHARE) * found))
+        return total, {"psnr": recent}
 
+    steps = RecordableLoss(prepare, loss, generator, rays * cache.weights.shape[1], slots)
     with radiance_field.computing_in(config.optimiser.precision):
-        fit(model, config.optimiser, step_loss, checkpoint, "fit latent NeRF", team=team)
-    return recent[0]
+        fit(model, config.optimiser, steps, checkpoint, "fit latent NeRF", team=team)
+    return float(recent)
 
 
 def _targets(relit_path: Path, pool: RayPool, views: list[int], num_samples: int) -> Tensor:

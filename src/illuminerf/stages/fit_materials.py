@@ -110,14 +110,14 @@ def _fit(found: FittedMaterials, mesh: TriangleMesh, views: Views, config: Confi
     shading = DifferentiableShading(mesh, config.fit.map_height, config.fit.max_depth, config.fit.device)
     recent = [0.0]
 
-    def step_loss(step: int) -> tuple[Tensor, dict[str, float]]:
+    def step_loss(step: int) -> tuple[Tensor, dict[str, Tensor]]:
         generator = torch_generator(config.seed, "pixels", step)
         rays, srgb = pixels.drawn(config.optimiser.rays_per_step, generator)
         seed = derived_seed(config.seed, STAGE, step)
         loss, psnr = photometric_loss(found, shading, rays, srgb, config.fit, seed)
         share = _RECENT_SHARE if recent[0] else 0.0
         recent[0] = share * recent[0] + (1 - share) * psnr
-        return loss + found.prior(), {"psnr": recent[0]}
+        return loss + found.prior(), {"psnr": torch.tensor(recent[0])}
 
     fit(found, config.optimiser, step_loss, checkpoint, "fit materials")
     return recent[0]

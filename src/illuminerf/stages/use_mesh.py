@@ -198,7 +198,7 @@ def _fit_appearance(
     srgb = pool.values(views.premultiplied())
     radiance_field.surface.requires_grad_(False)
 
-    def step_loss(step: int) -> tuple[torch.Tensor, dict[str, float]]:
+    def step_loss(step: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         generator = torch_generator(config.seed, "appearance", step, device=device)
         index = pool.draw(config.optimiser.rays_per_step, generator)
         return appearance_loss(radiance_field, pool, srgb, index, generator)
