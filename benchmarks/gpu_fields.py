@@ -1,6 +1,6 @@
 """The fields on a GPU: are the kernels right, how fast are they, how long is the paper's fit; prints JSON.
 
-python benchmarks/gpu_fields.py [--device cuda] [--steps 25000] [--rays 8192] [--seconds 5] [--profile] [--tiny]
+python benchmarks/gpu_fields.py [--device cuda] [--preset paper] [--steps 25000] [--seconds 5] [--profile] [--tiny]
 
 In this order: the Triton kernels against their readable twin (gpu/check_kernels.py); the device's ceilings, measured;
 the hash grid at 2^17 points and 16 levels and at what the paper's surface asks for, kernel and plain torch in the same
@@ -38,6 +38,7 @@ from illuminerf.fields.ray_guide import RayGuide
 from illuminerf.fields.recorded_steps import RecordableLoss
 from illuminerf.fields.shading_cache import cache_shading, latent_loss
 from illuminerf.fields.shading_slots import ShadingSlots
+from illuminerf.presets import PRESETS
 from illuminerf.workflow.device import Precision, resolve_device, torch_generator
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import track
@@ -60,8 +61,8 @@ Step = Callable[[int], object]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda")
+    parser.add_argument("--preset", default="paper", choices=PRESETS, help="whose fields and rays per step")
     parser.add_argument("--steps", type=int, default=_STEPS, help="of each fit; minutes are extrapolated from fewer")
-    parser.add_argument("--rays", type=int, default=8192, help="of each step")
     parser.add_argument("--seconds", type=float, default=5.0, help="for each measurement of a kernel")
     parser.add_argument("--profile", action="store_true", help="name the kernels that take most of a step")
     parser.add_argument("--tiny", action="store_true", help="small grids, few rays, a moment for everything")
@@ -81,7 +82,9 @@ def main() -> None:
 
 def measured(device: torch.device, options: argparse.Namespace) -> dict[str, Any]:
     """Everything, and whether it holds together."""
-    config, rays, seconds, steps, points = FieldConfig.paper(), options.rays, options.seconds, options.steps, 1 << 17
+    preset = PRESETS[options.preset].geometry
+    config, rays = preset.radiance_field, preset.optimiser.rays_per_step
+    seconds, steps, points = options.seconds, options.steps, 1 << 17
     if options.tiny:
         config, rays, seconds, steps, points = small_field(), 64, 0.05, 3, 1 << 10
     kernels = checked_kernels(device, options.tiny)
@@ -96,7 +99,7 @@ def measured(device: torch.device, options: argparse.Namespace) -> dict[str, Any
         "device": str(device) if device.type == "cpu" else torch.cuda.get_device_name(device),
         "torch": torch.__version__,
         "load_average": round(os.getloadavg()[0], 2),
-        "sizes": "tiny" if options.tiny else "paper",
+        "sizes": "tiny" if options.tiny else options.preset,
         "rays_per_step": rays,
         "kernels": kernels,
         "ceilings": ceiling,

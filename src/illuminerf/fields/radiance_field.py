@@ -77,7 +77,7 @@ class FieldConfig:
             proposal=ProposalConfig(HashGridConfig(6, 2, 19, 16, 512), 64),
             num_proposal_samples=64,
             num_samples=64,
-            min_weight=0.0,
+            min_weight=1e-4,
         )
 
 
