@@ -66,6 +66,7 @@ ABLATIONS: dict[str, Ablation] = {
     "black_background": _with_losses(random_background=False),
     "even_rays": _with_losses(guided_share=0.0),
     "zero_level": lambda config: replace(config, outlines_set_level=False),
+    "predicted_mesh_normals": lambda config: replace(config, mesh_normals="predicted"),
 }
 """What each changes of a geometry's settings: one thing."""
 

@@ -16,7 +16,7 @@ from illuminerf.data.capture import load_capture
 from illuminerf.fields.bounds import OccupiedCells, visual_hull
 from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_steps, start_from_cells
 from illuminerf.fields.image_rendering import observed_cells, render_image
-from illuminerf.fields.meshing import extract_mesh
+from illuminerf.fields.meshing import MeshNormals, extract_mesh
 from illuminerf.fields.optimisation import OptimiserConfig, fit
 from illuminerf.fields.outlines import outline_level
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
@@ -52,6 +52,8 @@ class Config:
     outlines_set_level: bool = True
     """The mesh is taken where its outlines are those of the photographs (see `outline_level`). False: at zero, as in
     UniSDF, for comparison."""
+    mesh_normals: MeshNormals = "averaged"
+    """Smooth normals of the mesh: the surface's own, averaged, or the predicted ones, as in the paper."""
     min_component_share: float = 0.01
     """Mesh components below this share of the largest one's area are dropped."""
     num_held_out_views: int = 2
@@ -111,7 +113,13 @@ def run(capture_path: Path, config: Config, out: Path) -> Path:
         if config.outlines_set_level and bool(near_surface.cells.any()):
             level = _level(radiance_field, near_surface, views, fitted, has_masks, config.seed)
         mesh = extract_mesh(
-            radiance_field.surface, near_surface, config.mesh_resolution, config.min_component_share, cells, level
+            radiance_field.surface,
+            near_surface,
+            config.mesh_resolution,
+            config.min_component_share,
+            cells,
+            level,
+            config.mesh_normals,
         )
         mesh.save_glb(out / "mesh.glb")
         shell = surface_shell(radiance_field.surface, cells)

@@ -12,7 +12,7 @@ from typing import Any
 
 from illuminerf.workflow.errors import UserError
 
-SCHEMA = 4
+SCHEMA = 5
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ _NEW_FIELDS = (
     NewField(3, "estimate_geometry", "losses.random_background", False),
     NewField(4, "estimate_geometry", "losses.guided_share", 0.0),
     NewField(4, "estimate_geometry", "outlines_set_level", False),
+    NewField(5, "estimate_geometry", "mesh_normals", "predicted"),
 )
 
 
