@@ -34,6 +34,7 @@ from illuminerf.fields.geometry_fit import GeometryLossConfig, geometry_loss
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
 from illuminerf.fields.radiance_field import FieldConfig, RadianceField
 from illuminerf.fields.shading_cache import cache_shading, latent_loss
+from illuminerf.fields.surface import SurfaceField
 from illuminerf.workflow.device import Precision, resolve_device, torch_generator
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import track
@@ -171,8 +172,9 @@ def _wait(device: torch.device) -> None:
 
 @contextmanager
 def in_plain_torch() -> Iterator[None]:
-    """On a GPU: hash grids by their readable twin instead of their kernels."""
-    with mock.patch.object(HashGrid, "_interpolated", readable):
+    """On a GPU: hash grids and surfaces by their readable twins instead of their kernels."""
+    without = mock.patch.object(SurfaceField, "_kernels", lambda surface, positions: None)
+    with mock.patch.object(HashGrid, "_interpolated", readable), without:
         yield
 
 
