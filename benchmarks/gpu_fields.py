@@ -38,6 +38,7 @@ from illuminerf.fields.ray_guide import RayGuide
 from illuminerf.fields.recorded_steps import RecordableLoss
 from illuminerf.fields.shading_cache import cache_shading, latent_loss
 from illuminerf.fields.shading_slots import ShadingSlots
+from illuminerf.fields.surface import SurfaceField
 from illuminerf.presets import PRESETS
 from illuminerf.workflow.device import Precision, resolve_device, torch_generator
 from illuminerf.workflow.errors import UserError
@@ -177,8 +178,9 @@ def _wait(device: torch.device) -> None:
 
 @contextmanager
 def in_plain_torch() -> Iterator[None]:
-    """On a GPU: hash grids by their readable twin instead of their kernels."""
-    with mock.patch.object(HashGrid, "_interpolated", readable):
+    """On a GPU: hash grids and surfaces by their readable twins instead of their kernels."""
+    without = mock.patch.object(SurfaceField, "_kernels", lambda surface, positions: None)
+    with mock.patch.object(HashGrid, "_interpolated", readable), without:
         yield
 
 

@@ -1,4 +1,4 @@
-"""The hash grid's kernels against their readable twin, and the tests that need a GPU; prints JSON.
+"""Kernels of hash grid and surface against their readable twins, and the tests that need a GPU; prints JSON.
 
 python benchmarks/gpu/check_kernels.py [--device auto] [--points 20000] [--tiny]
 
@@ -6,10 +6,13 @@ Relative errors (largest difference over largest value) between kernels on the d
 CPU: features, Jacobian, gradient of the table, and the gradient of a loss on normals against double backward through
 the positions. "hash_grid" is what `HashGrid` runs in float64, "triton" the Triton kernels, which need CUDA or
 TRITON_INTERPRET=1. In float32 the twin computes in float32 too: near the borders of cells another rounding is another
-cell, with another Jacobian. Where there is CUDA, `pytest -m gpu` runs as well. Exit status 1 where anything is wrong.
+cell, with another Jacobian. "surface" are the surface's Triton kernels in float32: distance, gradient, and what a loss on
+both sends to the table and the layers. Where there is CUDA, `pytest -m gpu` runs as well. Exit status 1 where anything
+is wrong.
 """
 
 import argparse
+import copy
 import json
 import os
 import subprocess
@@ -23,6 +26,7 @@ import torch
 from torch import Tensor
 
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig, interpolate
+from illuminerf.fields.surface import SurfaceConfig, SurfaceField
 from illuminerf.workflow.device import resolve_device
 
 TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-4}
@@ -41,14 +45,53 @@ def check(device: torch.device, num_points: int, is_tiny: bool) -> dict[str, Any
     for name, interpolate_, dtype in kernels:
         generator = torch.Generator().manual_seed(2)
         positions = torch.rand(num_points, 3, generator=generator, dtype=dtype) * 1.9 - 0.95
-        grid, copy = pair_of_grids(config, device, dtype)
-        wanted, there = twins(copy, positions), positions.to(device)
+        grid, twin = pair_of_grids(config, device, dtype)
+        wanted, there = twins(twin, positions), positions.to(device)
         errors = relative_errors(ours(grid, there, interpolate_), wanted)
         wrong = relative_errors(ours(grid, there, interpolate_, frozen_slope=True), wanted)["second_order"]
         name = f"{name} {dtype}".replace("torch.", "")
         report["relative_errors"][name], report["of_a_wrong_second_order"][name] = errors, wrong
         report["passed"] &= max(errors.values()) < TOLERANCES[dtype] and wrong > 3e-4
+    if kernels[0][0] == "triton":
+        errors, wrong = check_surface(device, num_points, is_tiny)
+        report["relative_errors"]["surface float32"] = errors
+        report["of_a_wrong_second_order"]["surface float32"] = wrong
+        report["passed"] &= max(errors.values()) < TOLERANCES[torch.float32] and wrong > 3e-4
     return report
+
+
+def check_surface(device: torch.device, num_points: int, is_tiny: bool) -> tuple[dict[str, float], float]:
+    """Errors of the surface's Triton kernels, and of a twin whose normals leave the features as they are."""
+    from illuminerf.fields.surface_triton import FusedSurface
+
+    torch.manual_seed(3)
+    grid = HashGridConfig(4, 2, 7, 3, 24) if is_tiny else HashGridConfig(10, 4, 15, 16, 1024)
+    surface = SurfaceField(SurfaceConfig(grid))
+    with torch.no_grad():
+        surface.grid.table.normal_(std=0.1)
+        surface.hidden.bias.mul_(0.1)
+    moved = copy.deepcopy(surface).to(device)
+    positions = torch.rand(num_points, 3) * 1.9 - 0.95
+    levels = torch.linspace(1, 0.5, grid.num_levels)
+    inputs = moved._kernel_inputs(positions.to(device), levels.to(device))
+    found = surface_answers(moved, *FusedSurface.apply(*inputs))
+    layout = (surface.grid._resolutions, surface.grid._sizes, surface.grid._offsets)
+    features, jacobian = interpolate(positions, surface.grid.table, *layout, with_jacobian=True)
+    columns = levels.repeat_interleave(grid.num_features)
+    features, jacobian = features * columns, jacobian * columns[:, None]
+    point = surface.residual(features, jacobian)
+    frozen = surface.residual(features.detach(), jacobian).gradient
+    wrong = relative_errors(found, surface_answers(surface, point.signed_distance, frozen))["table"]
+    return relative_errors(found, surface_answers(surface, *point)), wrong
+
+
+def surface_answers(surface: SurfaceField, distance: Tensor, gradient: Tensor) -> dict[str, Tensor]:
+    """Distance, gradient, and the gradients of a loss on both."""
+    layers = {"weight": surface.hidden.weight, "bias": surface.hidden.bias, "last": surface.head.weight}
+    parameters = {"table": surface.grid.table} | layers
+    loss = (distance**2).sum() + ((gradient.norm(dim=-1) - 1) ** 2).sum()
+    gradients = torch.autograd.grad(loss, list(parameters.values()), retain_graph=True)
+    return {"distance": distance, "gradient": gradient} | dict(zip(parameters, gradients, strict=True))
 
 
 def by_triton(grid: HashGrid, positions: Tensor) -> tuple[Tensor, Tensor]:
@@ -64,9 +107,8 @@ def pair_of_grids(config: HashGridConfig, device: torch.device, dtype: torch.dty
     grid = HashGrid(config).to(dtype)
     with torch.no_grad():
         grid.table.copy_(torch.randn(grid.table.shape, generator=torch.Generator().manual_seed(1)))
-    copy = HashGrid(config).to(dtype)
-    copy.load_state_dict(grid.state_dict())
-    return grid.to(device), copy
+    twin = copy.deepcopy(grid)
+    return grid.to(device), twin
 
 
 def ours(grid: HashGrid, positions: Tensor, interpolate_: Interpolate, frozen_slope: bool = False) -> dict[str, Tensor]:

@@ -107,7 +107,7 @@ def test_another_hash_is_noticed_on_the_hashed_level_alone(
 
 @needs_triton
 def test_an_eikonal_loss_trains_a_surface_through_the_kernels(found: dict[str, dict[str, Tensor]]) -> None:
-    """As on a GPU, where the surface has no kernel of its own: normals in forward mode, one backward pass."""
+    """As on a GPU where the surface's own kernels do not fit: normals in forward mode, one backward pass."""
     assert max(errors(found["eikonal"], eikonal_gradients(twin)).values()) < 1e-12
     # the guard: a tenth less of the eikonal term, the one of second order, shows in every gradient
     assert min(errors(found["eikonal"], eikonal_gradients(twin, weight=0.9)).values()) > 1e-3
@@ -146,7 +146,7 @@ for kernel, (dtype, features, jacobian) in itertools.product((kernels._forward, 
     types = dict.fromkeys(kernel.arg_names, "*" + dtype) | {"levels": "*i32"} | dict.fromkeys(constants, "constexpr")
     types |= {name: "i32" for name in types if name == "num_points" or name.endswith("stride")}
     places = {(kernel.arg_names.index(name),): value for name, value in constants.items()}
-    compiled = compile(ASTSource(kernel, types, places), target=GPUTarget("cuda", 90, 32), options=kernels._OPTIONS)
+    compiled = compile(ASTSource(kernel, types, places), target=GPUTarget("cuda", 90, 32), options=kernels.OPTIONS)
     assert len(compiled.asm["cubin"]) > 1000
 print("compiled")
 """

@@ -92,6 +92,10 @@ class HashGrid(nn.Module):
         columns = self._columns(level_weights)
         return features * columns, jacobian * columns[:, None]
 
+    def runs_in_triton(self, positions: Float[Tensor, "points 3"]) -> bool:
+        """Whether kernels in Triton take these positions: on a GPU that has them, for a table in float32."""
+        return positions.is_cuda and self.table.dtype == torch.float32 and _gpu_kernel(positions.device) is not None
+
     def _interpolated(self, positions: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor]:
         kernel: Any = KernelInterpolation
         if positions.is_cuda:

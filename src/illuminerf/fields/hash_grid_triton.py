@@ -29,9 +29,9 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-_POINTS_PER_PROGRAM = 128
+POINTS_PER_PROGRAM = 128
 # multiply and add stay two roundings as in the twin: fused, points on the border of two cells would change sides
-_OPTIONS = {"num_warps": 4, "enable_fp_fusion": False}
+OPTIONS = {"num_warps": 4, "enable_fp_fusion": False}
 
 
 @triton.jit
@@ -45,9 +45,43 @@ def _cell(positions, row, exists, axis: tl.constexpr, half, last):
 
 @triton.jit
 @no_type_check
-def _level(levels, level):
+def level_of(levels, level):
+    """Resolution, first entry, hash mask, stored densely or not, of a row of `level_rows`."""
     row = levels + level * 4
     return tl.load(row), tl.load(row + 1), tl.load(row + 2).to(tl.uint32), tl.load(row + 3) != 0
+
+
+@triton.jit
+@no_type_check
+def cells(positions, row, exists, resolution, half):
+    """The cells that points lie in, and where in them, from 0 to 1 along each axis."""
+    x, fx = _cell(positions, row, exists, 0, half, resolution - 1)
+    y, fy = _cell(positions, row, exists, 1, half, resolution - 1)
+    z, fz = _cell(positions, row, exists, 2, half, resolution - 1)
+    return x, y, z, fx, fy, fz
+
+
+@triton.jit
+@no_type_check
+def corner_weights(corner: tl.constexpr, fx, fy, fz):
+    """Of one of a cell's eight corners, along each axis; bits of the number are x, y and z."""
+    wx = fx if corner & 1 else 1 - fx
+    wy = fy if corner & 2 else 1 - fy
+    wz = fz if corner & 4 else 1 - fz
+    return wx, wy, wz
+
+
+@triton.jit
+@no_type_check
+def entries(corner: tl.constexpr, x, y, z, resolution, offset, hash_mask, is_dense):
+    """Rows of the table for one corner of cells; the compiler takes what corners share out of their loop."""
+    # 32 bits wrap, which leaves the low ones as they are in the twin's 64
+    side, hash_y, hash_z = (resolution + 1).to(tl.uint32), y * 2654435761, z * 805459861
+    hashed = hash_y + 2654435761 if corner & 2 else hash_y
+    hashed ^= hash_z + 805459861 if corner & 4 else hash_z
+    hashed ^= x + 1 if corner & 1 else x
+    dense = x + side * (y + side * z) + side * ((corner & 2) // 2 + side * (corner // 4)) + (corner & 1)
+    return offset.to(tl.int64) + tl.where(is_dense, dense, hashed & hash_mask).to(tl.int64)
 
 
 @triton.jit(do_not_specialize=["num_points"])
@@ -65,29 +99,18 @@ def _forward(
     block: tl.constexpr,
 ):
     level = tl.program_id(1)
-    resolution, offset, hash_mask, is_dense = _level(levels, level)
+    resolution, offset, hash_mask, is_dense = level_of(levels, level)
     point = tl.program_id(0) * block + tl.arange(0, block)
     exists, row = point < num_points, point.to(tl.int64)
     half = resolution.to(table.dtype.element_ty) * 0.5
-    x, fx = _cell(positions, row, exists, 0, half, resolution - 1)
-    y, fy = _cell(positions, row, exists, 1, half, resolution - 1)
-    z, fz = _cell(positions, row, exists, 2, half, resolution - 1)
+    x, y, z, fx, fy, fz = cells(positions, row, exists, resolution, half)
     feature = tl.arange(0, padded)
     kept = exists[:, None] & (feature < num_features)[None, :]
     value = tl.zeros((block, padded), table.dtype.element_ty)
     slope_x, slope_y, slope_z = value, value, value
-    # 32 bits wrap, which leaves the low ones as they are in the twin's 64
-    side, hash_y, hash_z = (resolution + 1).to(tl.uint32), y * 2654435761, z * 805459861
-    first = x + side * (y + side * z)
     for corner in tl.static_range(8):
-        wx = fx if corner & 1 else 1 - fx
-        wy = fy if corner & 2 else 1 - fy
-        wz = fz if corner & 4 else 1 - fz
-        hashed = hash_y + 2654435761 if corner & 2 else hash_y
-        hashed ^= hash_z + 805459861 if corner & 4 else hash_z
-        hashed ^= x + 1 if corner & 1 else x
-        dense = first + side * ((corner & 2) // 2 + side * (corner // 4)) + (corner & 1)
-        entry = offset.to(tl.int64) + tl.where(is_dense, dense, hashed & hash_mask).to(tl.int64)
+        wx, wy, wz = corner_weights(corner, fx, fy, fz)
+        entry = entries(corner, x, y, z, resolution, offset, hash_mask, is_dense)
         stored = tl.load(table + entry[:, None] * num_features + feature[None, :], mask=kept, other=0.0)
         value += (wx * wy * wz)[:, None] * stored
         if with_jacobian:
@@ -123,13 +146,11 @@ def _backward(
     block: tl.constexpr,
 ):
     level = tl.program_id(1)
-    resolution, offset, hash_mask, is_dense = _level(levels, level)
+    resolution, offset, hash_mask, is_dense = level_of(levels, level)
     point = tl.program_id(0) * block + tl.arange(0, block)
     exists, row = point < num_points, point.to(tl.int64)
     half = resolution.to(table_grad.dtype.element_ty) * 0.5
-    x, fx = _cell(positions, row, exists, 0, half, resolution - 1)
-    y, fy = _cell(positions, row, exists, 1, half, resolution - 1)
-    z, fz = _cell(positions, row, exists, 2, half, resolution - 1)
+    x, y, z, fx, fy, fz = cells(positions, row, exists, resolution, half)
     feature = tl.arange(0, padded)
     kept = exists[:, None] & (feature < num_features)[None, :]
     column = (level * num_features + feature)[None, :]
@@ -141,18 +162,9 @@ def _backward(
         to_x = tl.load(start, mask=kept, other=0.0) * half
         to_y = tl.load(start + axis_stride, mask=kept, other=0.0) * half
         to_z = tl.load(start + 2 * axis_stride, mask=kept, other=0.0) * half
-    # 32 bits wrap, which leaves the low ones as they are in the twin's 64
-    side, hash_y, hash_z = (resolution + 1).to(tl.uint32), y * 2654435761, z * 805459861
-    first = x + side * (y + side * z)
     for corner in tl.static_range(8):
-        wx = fx if corner & 1 else 1 - fx
-        wy = fy if corner & 2 else 1 - fy
-        wz = fz if corner & 4 else 1 - fz
-        hashed = hash_y + 2654435761 if corner & 2 else hash_y
-        hashed ^= hash_z + 805459861 if corner & 4 else hash_z
-        hashed ^= x + 1 if corner & 1 else x
-        dense = first + side * ((corner & 2) // 2 + side * (corner // 4)) + (corner & 1)
-        entry = offset.to(tl.int64) + tl.where(is_dense, dense, hashed & hash_mask).to(tl.int64)
+        wx, wy, wz = corner_weights(corner, fx, fy, fz)
+        entry = entries(corner, x, y, z, resolution, offset, hash_mask, is_dense)
         share = (wx * wy * wz)[:, None] * to_value
         if with_jacobian:
             share += (wy * wz if corner & 1 else -(wy * wz))[:, None] * to_x
@@ -170,15 +182,15 @@ class TritonInterpolation(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         """Returns features [points, levels * features] and, where asked, the Jacobian [.., 3] (else empty)."""
         positions = positions.detach().to(table.dtype).contiguous()
-        levels = _levels(layout.tobytes(), table.device)
+        levels = level_rows(layout.tobytes(), table.device)
         columns = len(levels) * table.shape[1]
         features = table.new_empty(len(positions), columns)
         # axes before columns, so that a thread writes its features in one go
         jacobian = table.new_empty(len(positions) if with_jacobian else 0, 3, columns)
         constants = _constants(table, with_jacobian)
-        with _current(table):
+        with current(table):
             _forward[_programs(positions, levels)](
-                positions, table, levels, features, jacobian, len(positions), *constants, **_OPTIONS
+                positions, table, levels, features, jacobian, len(positions), *constants, **OPTIONS
             )
         ctx.save_for_backward(positions, levels)
         ctx.table_shape, ctx.with_jacobian = table.shape, with_jacobian  # type: ignore[attr-defined]
@@ -191,9 +203,9 @@ class TritonInterpolation(torch.autograd.Function):
         table_grad = torch.zeros(ctx.table_shape, dtype=positions.dtype, device=positions.device)
         grads = (features_grad.contiguous(), jacobian_grad)
         constants = _constants(table_grad, ctx.with_jacobian)
-        with _current(table_grad):
+        with current(table_grad):
             _backward[_programs(positions, levels)](
-                positions, table_grad, levels, *grads, len(positions), *jacobian_grad.stride(), *constants, **_OPTIONS
+                positions, table_grad, levels, *grads, len(positions), *jacobian_grad.stride(), *constants, **OPTIONS
             )
         return table_grad, None, None, None
 
@@ -209,7 +221,7 @@ def why_not(device: torch.device) -> str:
 
 
 @functools.lru_cache(maxsize=64)
-def _levels(layout: bytes, device: torch.device) -> Tensor:
+def level_rows(layout: bytes, device: torch.device) -> Tensor:
     """`kernel_layout` in the form the kernels take: resolution, first entry, hash mask, stored densely or not."""
     rows = [
         [resolution, offset, size - 1, int((resolution + 1) ** 3 <= size)]
@@ -219,13 +231,13 @@ def _levels(layout: bytes, device: torch.device) -> Tensor:
 
 
 def _programs(positions: Tensor, levels: Tensor) -> tuple[int, int]:
-    return triton.cdiv(len(positions), _POINTS_PER_PROGRAM), len(levels)
+    return triton.cdiv(len(positions), POINTS_PER_PROGRAM), len(levels)
 
 
 def _constants(table: Tensor, with_jacobian: bool) -> tuple[int, int, bool, int]:
-    return table.shape[1], triton.next_power_of_2(table.shape[1]), with_jacobian, _POINTS_PER_PROGRAM
+    return table.shape[1], triton.next_power_of_2(table.shape[1]), with_jacobian, POINTS_PER_PROGRAM
 
 
-def _current(tensor: Tensor) -> contextlib.AbstractContextManager[object]:
+def current(tensor: Tensor) -> contextlib.AbstractContextManager[object]:
     """Triton launches on the current device, whatever the tensors are on."""
     return torch.cuda.device(tensor.device) if tensor.is_cuda else contextlib.nullcontext()

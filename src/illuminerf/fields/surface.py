@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from illuminerf.fields import surface_kernel
 from illuminerf.fields.bounds import OccupiedCells
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
-from illuminerf.fields.surface_kernel import FusedSurface, distance_alone
 from illuminerf.fields.volume_rendering import optical_depth
 from illuminerf.workflow.errors import UserError
 
@@ -83,8 +83,9 @@ class SurfaceField(nn.Module):
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> SurfacePoint:
         """Signed distance and its gradient."""
-        if self._has_kernel(positions):
-            distance, gradient = FusedSurface.apply(*self._kernel_inputs(positions, level_weights))
+        kernels = self._kernels(positions)
+        if kernels is not None:
+            distance, gradient = kernels.FusedSurface.apply(*self._kernel_inputs(positions, level_weights))
         else:
             distance, gradient = self.residual(*self.grid.with_jacobian(positions, level_weights))
         distance = distance + self.head.bias - self.config.initial_radius
@@ -109,20 +110,32 @@ class SurfaceField(nn.Module):
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> Float[Tensor, " points"]:
         """Signed distance alone, which is cheaper, most of all where no gradients are recorded."""
-        if self._has_kernel(positions) and not torch.is_grad_enabled():
-            distance = distance_alone(*self._kernel_inputs(positions, level_weights))
+        kernels = None if torch.is_grad_enabled() else self._kernels(positions)
+        if kernels is not None:
+            distance = kernels.distance_alone(*self._kernel_inputs(positions, level_weights))
         else:
             hidden = functional.softplus(self.hidden(self.grid(positions, level_weights)), beta=_SHARPNESS)
             distance = functional.linear(hidden, self.head.weight)[..., 0]
         return distance + self.head.bias + positions.norm(dim=-1) - self.config.initial_radius
 
-    def _has_kernel(self, positions: Tensor) -> bool:
-        return not positions.is_cuda and positions.dtype == torch.float32 and len(positions) > 0
+    def _kernels(self, positions: Tensor) -> Any:
+        """The module whose `FusedSurface` takes these positions, or None; then the readable twin does."""
+        if positions.dtype != torch.float32 or not len(positions):
+            return None
+        if not positions.is_cuda:
+            return surface_kernel
+        if not self.grid.runs_in_triton(positions):
+            return None
+        from illuminerf.fields import surface_triton
+
+        return surface_triton if max(self.hidden.weight.shape) <= surface_triton.WIDEST else None
 
     def _kernel_inputs(self, positions: Tensor, level_weights: Tensor | None) -> tuple[Any, ...]:
-        levels = torch.ones(self.config.grid.num_levels) if level_weights is None else level_weights
+        table, levels = self.grid.table, level_weights
+        if levels is None:
+            levels = table.new_ones(self.config.grid.num_levels)
         layers = (self.hidden.weight, self.hidden.bias, self.head.weight)
-        return (self.grid.table, *layers, positions, self.grid.layout, levels)
+        return (table, *layers, positions, self.grid.layout, levels)
 
     def predicted_normals(
         self, positions: Float[Tensor, "points 3"], level_weights: Float[Tensor, " levels"] | None = None
