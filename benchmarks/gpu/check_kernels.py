@@ -6,9 +6,9 @@ Relative errors (largest difference over largest value) between kernels on the d
 CPU: features, Jacobian, gradient of the table, and the gradient of a loss on normals against double backward through
 the positions. "hash_grid" is what `HashGrid` runs in float64, "triton" the Triton kernels, which need CUDA or
 TRITON_INTERPRET=1. In float32 the twin computes in float32 too: near the borders of cells another rounding is another
-cell, with another Jacobian. "surface" are the surface's Triton kernels in float32: distance, gradient, and what a loss on
-both sends to the table and the layers. Where there is CUDA, `pytest -m gpu` runs as well. Exit status 1 where anything
-is wrong.
+cell, with another Jacobian. "surface" are the surface's Triton kernels in float32: distance, gradient, and what a loss
+on both sends to the table and the layers. Where there is CUDA, `pytest -m gpu` runs as well. Exit status 1 where
+anything is wrong.
 """
 
 import argparse
