@@ -1,8 +1,9 @@
 """Signed distance and its gradient on a GPU, in Triton: the twin of `surface_kernel` for many points at once.
 
-As there, the Jacobian J of the hash grid is never formed. Letters are those of that file, per point:
+Unlike there, the Jacobian J of the hash grid is never formed, only products with it. Per point, with W the first layer
+as torch holds it, w the last one, s the slope of the softplus, and incoming g (distance) and v (gradient):
 
-    distance = w . softplus(W x + b)    p = W^T (s w)    gradient = J^T p    and with incoming g and v    q = J v.
+    distance = w . softplus(W x + b)    p = W^T (s w)    gradient = J^T p    q = J v.
 
 Kernels of two kinds pass arrays of one number per point and feature. Those of the grid take 128 points at one level, a
 thread each (`surface_grid_triton`): `gather` reads x, or q, `slopes` sums J^T p, `scatter` adds to the table's
@@ -17,13 +18,14 @@ each level) should come from L2:
     backward  x, q, p and the gradient of x, each written or read, q and the last one both           L (24 F)
 
 That is 1.8 kB where the Jacobian written, weighted and multiplied makes some 7 kB, for the surface of the paper preset
-(10 levels, F = 4). Kept from forward to backward: x and p, 320 bytes. Gradients of levels are summed afterwards, those
-of W from a number per program: there are atomics in the table's gradient only, and all else repeats to the bit.
+(10 levels, F = 4). Kept from forward to backward: x and p, 320 bytes. Sums over levels, and those of layers' gradients
+over programs, come afterwards: only the table's gradient takes atomics, all else repeats to the bit.
 
 Products of float32 are three of TensorFloat-32 on tensor cores, which round as float32 does but for a bit or two.
-Those without tensor cores ("ieee") read operands from shared memory for every few multiplications: several times slower
-by count, and they spill thousands of bytes in tiles of 64 points. Compiled for an H100 at the paper's sizes, kernels of
-the grid take 32 to 46 registers and those of the layers 125 and 255, the last of which spills 34.
+Those without tensor cores ("ieee") read operands from shared memory for every few multiplications: by count of
+instructions several times slower, and in tiles of 64 points they spill thousands of bytes. Compiled for an H100 at the
+paper's sizes, kernels of the grid take 32 to 46 registers, the forward one of the layers 125 and the backward one 255,
+with some 100 bytes spilt.
 """
 
 from typing import no_type_check
@@ -42,11 +44,11 @@ WIDEST = 64
 """Most features, and most hidden units, that the kernels of the layers are made for."""
 # with more points or fewer warps, what a thread holds of the products' operands does not fit into registers
 TILE = 32
-LAYER_OPTIONS = {"num_warps": 8, "num_stages": 2}
+LAYER_OPTIONS = {"num_warps": 8, "num_stages": 2, "enable_fp_fusion": True}
 _MOST_PARTS = 528
 """Programs that sum gradients of the layers: four for each multiprocessor of an H100 or H200."""
 _SHARPNESS = tl.constexpr(100.0)
-PRECISION = "tf32x3"
+PRECISION = "ieee" if torch.version.hip else "tf32x3"
 
 
 @triton.jit
