@@ -77,7 +77,7 @@ def fits(config: FieldConfig, num_rays: int, seconds: float, device: torch.devic
     srgb = torch.full((len(pool), 3), 0.5, device=device)
     alpha = (torch.arange(len(pool), device=device) < pool.num_foreground).float()
     losses = GeometryLossConfig()
-    levels = level_weights(field, losses, 1.0, device)
+    levels = level_weights(field, losses, torch.ones((), device=device))
 
     def geometry(number: int) -> Tensor:
         generator = torch_generator(0, number, device=device)

@@ -249,12 +249,10 @@ def speeds(
             torch.cuda.reset_peak_memory_stats(device)
         with field.computing_in(precision), in_plain_torch() if way.endswith("plain_torch") else nullcontext():
             stepper = Stepper(parameters, optimiser, loss(), records=records)
-            for number in range(6):  # slots settle, and a step is recorded
-                stepper.step(number)
+            list(stepper.run(0, 3 if steps < 10 else 40))  # slots settle, and a step is recorded
             _wait(device)
             start = time.perf_counter()
-            for number in track(range(6, 6 + count), f"{name}, {way}"):
-                numbers = stepper.step(number)
+            *_, numbers = track(stepper.run(40, 40 + count), f"{name}, {way}", count)
             _wait(device)
             rates[way] = count / (time.perf_counter() - start)
             del stepper
@@ -266,7 +264,7 @@ def speeds(
     if is_profiled:
         with field.computing_in("bfloat16"):
             stepper = Stepper(parameters, optimiser, loss(), records=False)
-            result["ms_by_kernel"] = _profile(stepper.step, device)
+            result["ms_by_kernel"] = _profile(lambda number: list(stepper.run(number, number + 1)), device)
     return result | {"loss": numbers["loss"]}
 
 

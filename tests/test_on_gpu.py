@@ -98,7 +98,7 @@ def test_recorded_steps_are_the_steps(
         steps = geometry_steps(field, GeometryLossConfig(), optimiser, pool, target, alpha, RayGuide(pool), seed)
         stepper = Stepper(field.parameters(), optimiser, steps, records=records)
         with field.computing_in(precision):
-            results.append([stepper.step(step)["loss"] for step in range(30)])
+            results.append([numbers["loss"] for numbers in stepper.run(0, 30)])
     recorded, launched, other = results
     assert recorded[:8] == pytest.approx(launched[:8], rel=1e-4)
     assert recorded == pytest.approx(launched, rel=0.02), "atomics add in any order, and differences grow"

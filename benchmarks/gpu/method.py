@@ -72,7 +72,7 @@ def geometry_work(config: FieldConfig, num_rays: int, device: torch.device) -> d
     alpha = (torch.arange(len(pool), device=device) < pool.num_foreground).float()
     srgb = torch.full((len(pool), 3), 0.5, device=device)
     losses = GeometryLossConfig()
-    levels = level_weights(field, losses, 1.0, device)
+    levels = level_weights(field, losses, torch.ones((), device=device))
     with FlopCounterMode(display=False) as counter:
         loss, _ = geometry_loss(field, losses, pool, srgb, alpha, index, levels, generator)
         loss.backward()

@@ -7,7 +7,6 @@ from typing import Any
 
 from illuminerf.cues.renderer import CueSampling
 from illuminerf.fields.appearance import AppearanceConfig
-from illuminerf.fields.geometry_fit import GeometryLossConfig
 from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.optimisation import OptimiserConfig
 from illuminerf.fields.radiance_field import FieldConfig
@@ -105,17 +104,14 @@ GPU = Preset(
             num_samples=32,
             num_proposal_samples=48,
         ),
-        optimiser=OptimiserConfig(num_steps=5000, rays_per_step=8192, warmup_steps=100, checkpoint_every=1000),
-        # guided rays and the mesh at its outlines came after the measurement, and are not measured at this size yet
-        losses=GeometryLossConfig(guided_share=0.0),
-        outlines_set_level=False,
+        optimiser=OptimiserConfig(num_steps=10_000, rays_per_step=8192, warmup_steps=200, checkpoint_every=2500),
         occupancy_side=96,
         mesh_resolution=320,
     ),
     illumination=estimate_illumination.Config(),
     relighting=relight_views.Config(num_samples=16),
     latent_nerf=fit_latent_nerf.Config(
-        optimiser=OptimiserConfig(num_steps=3000, rays_per_step=8192, warmup_steps=60, checkpoint_every=1000),
+        optimiser=OptimiserConfig(num_steps=5000, rays_per_step=8192, warmup_steps=100, checkpoint_every=2500),
         num_kept=8,
         max_rays=4_000_000,
     ),

@@ -92,7 +92,9 @@ def test_every_kind_can_be_fitted_stored_and_loaded(part: str, tmp_path) -> None
     index = pool.draw(16, generator)
     target = torch.rand(len(pool), 3, generator=generator)
     config = GeometryLossConfig(first_levels=1)
-    loss, _ = geometry_loss(field, config, pool, target, None, index, level_weights(field, config, 0.3), generator)
+    loss, _ = geometry_loss(
+        field, config, pool, target, None, index, level_weights(field, config, torch.tensor(0.3)), generator
+    )
     loss.backward()
     unused = {"appearance.glo.mlp.0.weight", "appearance.glo.mlp.2.weight"}
     assert {name for name, p in field.named_parameters() if p.grad is None} == unused
@@ -110,7 +112,7 @@ def test_without_coarse_to_fine_all_levels_are_on_from_the_second_step() -> None
     def learns_finest_level(share: float, progress: float) -> bool:
         field, generator = field_with("default"), torch.Generator().manual_seed(0)
         config = GeometryLossConfig(first_levels=1, coarse_to_fine_share=share)
-        levels = level_weights(field, config, progress)
+        levels = level_weights(field, config, torch.tensor(progress))
         geometry_loss(field, config, pool, target, None, index, levels, generator)[0].backward()
         grid = field.surface.grid
         assert grid.table.grad is not None

@@ -107,9 +107,9 @@ def test_no_positions() -> None:
 
 
 def test_levels_fade_in_one_after_the_other() -> None:
-    assert coarse_to_fine_weights(4, 0.0, 2).tolist() == [1, 1, 0, 0]
-    assert coarse_to_fine_weights(4, 0.25, 2).tolist() == [1, 1, 0.5, 0]
-    assert coarse_to_fine_weights(4, 3.0, 2).tolist() == [1, 1, 1, 1]
+    assert coarse_to_fine_weights(4, torch.tensor(0.0), 2).tolist() == [1, 1, 0, 0]
+    assert coarse_to_fine_weights(4, torch.tensor(0.25), 2).tolist() == [1, 1, 0.5, 0]
+    assert coarse_to_fine_weights(4, torch.tensor(3.0), 2).tolist() == [1, 1, 1, 1]
 
 
 def test_off_levels_do_not_count() -> None:

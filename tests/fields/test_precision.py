@@ -24,7 +24,7 @@ def _loss(field: RadianceField) -> Tensor:
     generator = torch.Generator().manual_seed(1)
     index = torch.arange(40)
     config = GeometryLossConfig(first_levels=2)
-    levels = level_weights(field, config, 1.0)
+    levels = level_weights(field, config, torch.tensor(1.0))
     return geometry_loss(field, config, pool, target, alpha, index, levels, generator)[0]
 
 

@@ -112,26 +112,23 @@ def test_a_step_with_fixed_slots_asks_the_device_nothing(capacity: int | None) -
     assert asked.operations == (set() if capacity else {"aten::nonzero", "aten::lift_fresh"})
 
 
-def _replaying(monkeypatch: pytest.MonkeyPatch, stepper: Stepper, steps: RecordableLoss) -> RecordedSteps:
-    """Makes a stepper run as on a GPU, but that a replay computes anew; counts recordings."""
+def _replaying(monkeypatch: pytest.MonkeyPatch, stepper: Stepper, steps: RecordableLoss) -> list[Any]:
+    """Makes a stepper run as on a GPU, but that a replay computes anew; the courses that are recorded."""
     stream = SimpleNamespace(wait_stream=lambda other: None)
     monkeypatch.setattr(torch.cuda, "Stream", lambda device: stream)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
     monkeypatch.setattr(torch.cuda, "stream", lambda chosen: nullcontext())
 
-    def compute() -> dict[str, torch.Tensor]:
-        return stepper._compute(steps.loss)
-
-    def record(recorded: RecordedSteps) -> None:
+    def record(recorded: RecordedSteps) -> bool:
         courses.append(recorded._tried)
-        replay = lambda: recorded._numbers.update(compute())  # noqa: E731
+        replay = lambda: setattr(recorded, "_row", recorded._computed())  # noqa: E731
         recorded._graph = SimpleNamespace(replay=replay)  # type: ignore[assignment]
+        return True
 
     courses: list[Any] = []
     monkeypatch.setattr(RecordedSteps, "_record", record)
-    stepper._recorded = RecordedSteps(steps, compute, torch.device("cpu"))
-    stepper._recorded.courses = courses  # type: ignore[attr-defined]
-    return stepper._recorded
+    stepper._recorded = stepper._recording(steps, torch.device("cpu"))
+    return courses
 
 
 def _fitted(monkeypatch: pytest.MonkeyPatch, capacity: int | None, replays: bool) -> dict[str, Any]:
@@ -140,8 +137,8 @@ def _fitted(monkeypatch: pytest.MonkeyPatch, capacity: int | None, replays: bool
     courses: list[Any] = []
     if replays:
         steps.slots.capacity = capacity
-        courses = _replaying(monkeypatch, stepper, steps).courses  # type: ignore[attr-defined]
-    losses = [stepper.step(step)["loss"] for step in range(_STEPS)]
+        courses = _replaying(monkeypatch, stepper, steps)
+    losses = [numbers["loss"] for numbers in stepper.run(0, _STEPS)]
     parameters = torch.cat([parameter.detach().view(-1) for parameter in field.parameters()])
     return {"losses": losses, "parameters": parameters, "errors": guide.errors, "courses": courses}
 
@@ -158,7 +155,24 @@ def test_a_fit_of_recorded_steps_is_the_fit(monkeypatch: pytest.MonkeyPatch) -> 
     field, _, steps = _made()
     stepper = Stepper(field.parameters(), _OPTIMISER, steps)
     steps.slots.capacity = 5
-    assert stepper.step(0)["loss"] != pytest.approx(wanted["losses"][0], rel=3e-4)
+    assert next(stepper.run(0, 1))["loss"] != pytest.approx(wanted["losses"][0], rel=3e-4)
+
+
+def test_steps_that_overflow_in_the_middle_of_a_block_are_done_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = _fitted(monkeypatch, None, replays=False)
+    field, guide, steps = _made()
+    stepper = Stepper(field.parameters(), _OPTIMISER, steps)
+    courses = _replaying(monkeypatch, stepper, steps)
+    monkeypatch.setattr(ShadingSlots, "fit_to", _fits_tightly)
+    losses = [numbers["loss"] for numbers in stepper.run(0, _STEPS)]
+    assert len(set(courses)) > 1, "the test needs steps that overflow"
+    assert losses == pytest.approx(wanted["losses"], rel=1e-5)
+    torch.testing.assert_close(guide.errors, wanted["errors"], rtol=0, atol=1e-5)
+
+
+def _fits_tightly(slots: ShadingSlots, wanted: int, most: int) -> None:
+    """Not a slot more than it takes."""
+    slots.capacity = max(wanted, slots.capacity or 0)
 
 
 def test_a_step_that_overflows_changes_nothing() -> None:
@@ -167,7 +181,8 @@ def test_a_step_that_overflows_changes_nothing() -> None:
     stepper = Stepper(field.parameters(), _OPTIMISER, steps)
     for capacity, changes in ((5, False), (128, True)):
         steps.slots.capacity = capacity
-        stepper.step(_STEPS - 1)
+        steps.slots.forgive()
+        list(stepper.run(_STEPS - 1, _STEPS))
         assert any(not torch.equal(p, old) for p, old in zip(field.parameters(), before, strict=True)) is changes
         assert bool((guide.errors != 1).any()) is changes
 
@@ -177,13 +192,15 @@ def test_what_cannot_be_recorded_is_launched(
 ) -> None:
     field, _, steps = _made()
     stepper = Stepper(field.parameters(), _OPTIMISER, steps)
-    _replaying(monkeypatch, stepper, steps)
 
-    def fails(recorded: RecordedSteps) -> None:
+    def fails() -> None:
         raise RuntimeError("operation not permitted\nwhen stream is capturing")
 
-    monkeypatch.setattr(RecordedSteps, "_record", fails)
-    losses = [stepper.step(step)["loss"] for step in range(_STEPS)]
+    record = RecordedSteps._record
+    _replaying(monkeypatch, stepper, steps)
+    monkeypatch.setattr(RecordedSteps, "_record", record)
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", fails)
+    losses = [numbers["loss"] for numbers in stepper.run(0, _STEPS)]
     assert losses == pytest.approx(_fitted(monkeypatch, None, replays=False)["losses"], rel=1e-5)
     assert capsys.readouterr().err.count("cannot be recorded: operation not permitted") == 1
     assert steps.slots.capacity is None

@@ -63,13 +63,11 @@ class LevelWeights(NamedTuple):
     normals: Float[Tensor, " normal_levels"]
 
 
-def level_weights(
-    field: RadianceField, config: GeometryLossConfig, progress: float, device: torch.device | str = "cpu"
-) -> LevelWeights:
-    """Those of the share of the fit that is over."""
+def level_weights(field: RadianceField, config: GeometryLossConfig, progress: Float[Tensor, ""]) -> LevelWeights:
+    """Those of the share of the fit that is over (float64)."""
     phase, first = progress / max(config.coarse_to_fine_share, 1e-6), config.first_levels
     levels = field.config.surface.grid.num_levels, field.surface.num_normal_levels
-    return LevelWeights(*(coarse_to_fine_weights(count, phase, first, device) for count in levels))
+    return LevelWeights(*(coarse_to_fine_weights(count, phase, first) for count in levels))
 
 
 def geometry_loss(
@@ -102,11 +100,12 @@ def geometry_loss(
     slots = slots or ShadingSlots()
     samples = field.sample(origins, directions, near, far, draws, levels.distance)
     points = field.worth_shading(samples, slots)
-    predicted, shading = field.shading_normals(points, levels.normals)
-    srgb = field.shade(points, shading, directions)
-
+    # at once, so that the gradient of the table is made once
     noise = draws.normal(len(points.positions), 3) * config.smoothness_sigma
-    perturbed = field.surface.predicted_normals(points.positions + noise, levels.normals)
+    both = torch.cat([points.positions, points.positions + noise])
+    predicted, perturbed = field.surface.predicted_normals(both, levels.normals).chunk(2)
+    srgb = field.shade(points, field.seen_normals(points, predicted), directions)
+
     anywhere = draws.uniform(3) * 1.6 - 0.8
     gradients = torch.cat([samples.end_gradients.view(-1, 3), field.surface(anywhere, levels.distance).gradient])
 
@@ -154,22 +153,22 @@ def geometry_steps(
     """
     device, rays = pool.view.device, optimiser.rays_per_step
     generator = torch.Generator(device)
-    levels = level_weights(field, config, 0.0, device)
-    slots, num_guided = ShadingSlots(), 0
+    slots, progress, num_guided = ShadingSlots(), torch.zeros((), dtype=torch.float64, device=device), 0
 
     def prepare(step: int) -> int:
         nonlocal num_guided
         generator.manual_seed(derived_seed(seed, "geometry", step))
-        progress = step / optimiser.num_steps
-        for weights, now in zip(levels, level_weights(field, config, progress), strict=True):
-            weights.copy_(now)
-        num_guided = 0 if guide is None or progress < _GUIDED_FROM else round(rays * config.guided_share)
+        progress.fill_(step / optimiser.num_steps)
+        num_guided = (
+            0 if guide is None or step < _GUIDED_FROM * optimiser.num_steps else round(rays * config.guided_share)
+        )
         return num_guided
 
     def loss() -> tuple[Tensor, dict[str, Tensor]]:
         index = pool.draw(rays - num_guided, generator)
         if guide is not None and num_guided:
             index = torch.cat([index, guide.draw(num_guided, generator)])
+        levels = level_weights(field, config, progress)
         return geometry_loss(
             field, config, pool, target_srgb, target_alpha, index, levels, generator, team, guide, slots
         )
@@ -192,7 +191,7 @@ def start_from_cells(
     target = signed_distance_of_cells(cells.cells).to(cells.cells.device) + _HULL_MARGIN_CELLS * 2 / side
     close = (target.abs() < 0.15).view(-1).nonzero()[:, 0]
     surface = field.surface
-    levels = coarse_to_fine_weights(surface.config.grid.num_levels, 0.0, first_levels, close.device)
+    levels = coarse_to_fine_weights(surface.config.grid.num_levels, torch.zeros((), device=close.device), first_levels)
     parameters = [*surface.grid.parameters(), *surface.hidden.parameters(), *surface.head.parameters()]
     optimiser = torch.optim.Adam(parameters, lr=5e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
     generator = torch_generator(seed, "start from cells", device=close.device)

@@ -162,13 +162,11 @@ def _entries(corner: Tensor, resolution: int, size: int) -> Tensor:
     return (x * _PRIMES[0] ^ y * _PRIMES[1] ^ z * _PRIMES[2]) & (size - 1)
 
 
-def coarse_to_fine_weights(
-    num_levels: int, progress: float, first_levels: int, device: torch.device | str = "cpu"
-) -> Float[Tensor, " levels"]:
+def coarse_to_fine_weights(num_levels: int, progress: Float[Tensor, ""], first_levels: int) -> Float[Tensor, " levels"]:
     """Weight of each level as training goes: `first_levels` are on at progress 0, all at progress 1 and after.
 
     Args:
         progress: share of the coarse-to-fine phase that is over.
     """
-    active = first_levels + min(max(progress, 0.0), 1.0) * (num_levels - first_levels)
-    return (active - torch.arange(num_levels, device=device, dtype=torch.float32)).clamp(0, 1)
+    active = first_levels + progress.clamp(0, 1) * (num_levels - first_levels)
+    return (active - torch.arange(num_levels, device=progress.device, dtype=torch.float32)).clamp(0, 1)

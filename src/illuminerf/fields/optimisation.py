@@ -5,15 +5,16 @@ the share's size, and gradients are added up before Adam. What comes out is what
 rounding; with the same number of processes it is the same bytes again (on CPUs).
 """
 
+import functools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from illuminerf.fields.recorded_steps import Numbers, RecordableLoss, RecordedSteps, as_floats
+from illuminerf.fields.recorded_steps import Numbers, RecordableLoss, RecordedSteps
 from illuminerf.workflow.checkpoint import (
     load_checkpoint,
     optimizer_tensors,
@@ -87,26 +88,41 @@ class Stepper:
         device = self._parameters[0].device
         self._recorded = None
         if records and device.type == "cuda" and team.is_alone and isinstance(step_loss, RecordableLoss):
-            loss = step_loss.loss
-            self._recorded = RecordedSteps(step_loss, lambda: self._compute(loss), device)
+            self._recorded = self._recording(step_loss, device)
         # a recording reads the rate from memory
         rate = torch.zeros((), device=device) if self._recorded else 0.0
         self.optimiser = torch.optim.Adam(
             self._parameters, rate, (0.9, 0.99), 1e-15, fused=True, capturable=self._recorded is not None
         )
 
-    def step(self, step: int) -> dict[str, float]:
-        """Take one step; "loss" over all processes' rays, and the numbers that come with it."""
+    def run(self, first: int, end: int) -> Iterator[dict[str, float]]:
+        """Take steps from `first` up to `end`; of each "loss", over all processes' rays, and the numbers beside it.
+
+        Where steps are recorded, the fit is that after a yielded step only when it was the last.
+        """
+        if self._recorded is not None:
+            yield from self._recorded.run(first, end)
+            return
+        for step in range(first, end):
+            self._set_rate(step)
+            numbers = self._compute(functools.partial(self._step_loss, step))
+            names, values = list(numbers), list(numbers.values())
+            yield dict(zip(names, torch.stack([v.double().to(values[0].device) for v in values]).tolist(), strict=True))
+
+    def _recording(self, loss: RecordableLoss, device: torch.device) -> RecordedSteps:
+        def prepare(step: int) -> Hashable:
+            self._set_rate(step)
+            return loss.prepare(step)
+
+        return RecordedSteps(loss, prepare, lambda: self._compute(loss.loss), device)
+
+    def _set_rate(self, step: int) -> None:
+        rate = self._config.learning_rate(step)
         for group in self.optimiser.param_groups:
-            rate = self._config.learning_rate(step)
             if isinstance(group["lr"], Tensor):
                 group["lr"].fill_(rate)
             else:
                 group["lr"] = rate
-        if self._recorded is not None:
-            return self._recorded(step)
-        numbers = self._compute(lambda: self._step_loss(step))
-        return dict(zip(numbers, as_floats(list(numbers.values())), strict=True))
 
     def _compute(self, loss_of_step: Callable[[], tuple[Tensor, Numbers]]) -> Numbers:
         rays, team = self._config.rays_per_step, self._team
@@ -159,16 +175,17 @@ def fit(
         start()
     team.start_equal(parameters.values())
     with step_progress(description, config.num_steps, first) as progress:
-        for step in range(first, config.num_steps):
-            numbers = stepper.step(step)
-            if not math.isfinite(numbers["loss"]):
-                raise FloatingPointError(f"the loss is {numbers['loss']} at step {step} of {description}")
-            is_due = (step + 1) % config.checkpoint_every == 0 and step + 1 < config.num_steps
-            if is_due and team.is_first:
+        while first < config.num_steps:
+            end = min((first // config.checkpoint_every + 1) * config.checkpoint_every, config.num_steps)
+            for step, numbers in enumerate(stepper.run(first, end), first):
+                if not math.isfinite(numbers["loss"]):
+                    raise FloatingPointError(f"the loss is {numbers['loss']} at step {step} of {description}")
+                progress.advance(1, **numbers)
+            first = end
+            if first < config.num_steps and team.is_first:
                 tensors: dict[str, Tensor] = {f"parameter.{name}": p for name, p in parameters.items()}
                 tensors |= {f"state.{name}": tensor for name, tensor in state.items()}
-                save_checkpoint(checkpoint, tensors | optimizer_tensors(stepper.optimiser), {"step": step + 1})
-            progress.advance(1, **numbers)
+                save_checkpoint(checkpoint, tensors | optimizer_tensors(stepper.optimiser), {"step": first})
 
 
 def _restore(

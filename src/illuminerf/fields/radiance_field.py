@@ -205,7 +205,11 @@ class RadianceField(nn.Module):
     ) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"]]:
         """Predicted normals, and the normals that the radiance fields see."""
         predicted = self.surface.predicted_normals(points.positions, level_weights)
-        return predicted, predicted if self.config.radiance_normals == "predicted" else points.density_normals
+        return predicted, self.seen_normals(points, predicted)
+
+    def seen_normals(self, points: ShadingPoints, predicted: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
+        """The normals that the radiance fields see."""
+        return predicted if self.config.radiance_normals == "predicted" else points.density_normals
 
 
 def _crossing(distance: Tensor) -> Tensor:

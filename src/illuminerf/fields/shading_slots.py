@@ -20,13 +20,23 @@ class ShadingSlots:
     Attributes:
         capacity: number of slots; None: as many as it takes.
         wanted: int64 [], how many samples were worth shading when last chosen.
-        overflow: float32 [], 1 where they were more than slots, else 0; None without a capacity.
+        overflow: float32 [], 1 where they were more than slots, then or at any time since `forgive`, else 0; None
+            without a capacity.
     """
 
     def __init__(self, capacity: int | None = None) -> None:
         self.capacity = capacity
-        self.wanted: Tensor | None = None
-        self.overflow: Tensor | None = None
+        self.wanted = torch.tensor(0)
+        self._overflow: Tensor | None = None
+
+    @property
+    def overflow(self) -> Float[Tensor, ""] | None:
+        return None if self.capacity is None else self._overflow
+
+    def forgive(self) -> None:
+        """Count overflows anew."""
+        if self._overflow is not None:
+            self._overflow.zero_()
 
     def choose(
         self, is_worth: Bool[Tensor, "rays samples"]
@@ -39,7 +49,9 @@ class ShadingSlots:
             return chosen, None
         place = flat.cumsum(0)
         self.wanted = place[-1]
-        self.overflow = (self.wanted > self.capacity).float()
+        if self._overflow is None:
+            self._overflow = torch.zeros((), device=flat.device)
+        self._overflow.copy_(torch.maximum(self._overflow, (self.wanted > self.capacity).float()))
         # what is not worth it comes behind what is: different samples, for equal ones take turns in a gradient
         behind = self.wanted + torch.arange(1, len(flat) + 1, device=flat.device) - place
         slot = torch.where(flat, place, behind) - 1

@@ -28,6 +28,7 @@ paper's sizes, kernels of the grid take 32 to 46 registers, the forward one of t
 with some 100 bytes spilt.
 """
 
+from collections.abc import Sequence
 from typing import no_type_check
 
 import numpy as np
@@ -258,7 +259,7 @@ def _sizes(table: Tensor) -> tuple[int, int, int]:
     return table.shape[1], triton.next_power_of_2(table.shape[1]), POINTS_PER_PROGRAM
 
 
-def _layer_sizes(features: Tensor, layers: tuple[Tensor, ...]) -> tuple[int, int, int, int, int]:
+def _layer_sizes(features: Tensor, layers: Sequence[Tensor]) -> tuple[int, int, int, int, int]:
     """Products are of 16 numbers at least, and of powers of two."""
     num_hidden, width = layers[0].shape
     padded = (max(16, triton.next_power_of_2(size)) for size in (width, num_hidden))
