@@ -88,7 +88,7 @@ def test_recorded_steps_are_the_steps(
     # of this noise there is as much as slots, so that what is drawn after it depends on their number
     monkeypatch.setattr(StepDraws, "normal", lambda draws, *shape: torch.zeros(*shape, device="cuda"))
     results = []
-    for records, seed in ((True, 0), (False, 0), (False, 1)):
+    for records, seed in ((True, 0), (False, 0), (False, 0), (False, 1)):
         torch.manual_seed(seed)
         field = RadianceField(FieldConfig.embedded()).to("cuda")
         pool = sphere_pool(torch.device("cuda"), 48)
@@ -99,9 +99,11 @@ def test_recorded_steps_are_the_steps(
         stepper = Stepper(field.parameters(), optimiser, steps, records=records)
         with field.computing_in(precision):
             results.append([numbers["loss"] for numbers in stepper.run(0, 30)])
-    recorded, launched, other = results
+    recorded, launched, again, other = results
     assert recorded[:8] == pytest.approx(launched[:8], rel=1e-4)
-    assert recorded == pytest.approx(launched, rel=0.02), "atomics add in any order, and differences grow"
+    # atomics add in any order, and differences grow: as far as between two fits whose steps are launched, or so
+    apart = max(abs(one - two) for one, two in zip(launched, again, strict=True))
+    assert recorded == pytest.approx(launched, rel=0.02, abs=4 * apart)
     # the guard: other seeds have other losses from the start
     assert other[:8] != pytest.approx(launched[:8], rel=1e-4)
     assert "cannot be recorded" not in capsys.readouterr().err

@@ -21,11 +21,10 @@ That is 1.8 kB where the Jacobian written, weighted and multiplied makes some 7 
 (10 levels, F = 4). Kept from forward to backward: x and p, 320 bytes. Sums over levels, and those of layers' gradients
 over programs, come afterwards: only the table's gradient takes atomics, all else repeats to the bit.
 
-Products of float32 are three of TensorFloat-32 on tensor cores, which round as float32 does but for a bit or two.
-Those without tensor cores ("ieee") read operands from shared memory for every few multiplications: by count of
-instructions several times slower, and in tiles of 64 points they spill thousands of bytes. Compiled for an H100 at the
-paper's sizes, kernels of the grid take 32 to 46 registers, the forward one of the layers 125 and the backward one 255,
-with some 100 bytes spilt.
+Products of float32 are three of TensorFloat-32 on tensor cores, which round as float32 does but for a bit or two (3e-7
+of the readable twin, measured). Those without tensor cores ("ieee") read operands from shared memory for every few
+multiplications: by count of instructions several times slower. On an H200, at the paper's sizes, forward and backward
+of 532 thousand points take 3.3 ms, of which the layers are 1.3.
 """
 
 from collections.abc import Sequence
@@ -43,9 +42,9 @@ from illuminerf.fields.surface_grid_triton import gather, scatter, slopes
 
 WIDEST = 64
 """Most features, and most hidden units, that the kernels of the layers are made for."""
-# with more points or fewer warps, what a thread holds of the products' operands does not fit into registers
+# measured on an H200; with eight warps the backward kernel takes 1.46 ms instead of 1.00
 TILE = 32
-LAYER_OPTIONS = {"num_warps": 8, "num_stages": 2, "enable_fp_fusion": True}
+LAYER_OPTIONS = {"num_warps": 4, "num_stages": 2, "enable_fp_fusion": True}
 _MOST_PARTS = 528
 """Programs that sum gradients of the layers: four for each multiprocessor of an H100 or H200."""
 _SHARPNESS = tl.constexpr(100.0)
