@@ -93,8 +93,8 @@ _FINE_GRID = HashGridConfig(log2_entries=20, finest=1024)
 GPU = Preset(
     name="gpu",
     description=(
-        "For one GPU and photographs of about 400 pixels, S = 16, with the model that ships: two objects under three "
-        "lights each took seven minutes side by side on an H200."
+        "For one GPU and photographs of about 400 pixels, S = 16, with the model that ships; two fits of geometry "
+        "side by side took four minutes on an H200."
     ),
     capture=import_capture.Config(size=400),
     geometry=estimate_geometry.Config(

@@ -20,7 +20,7 @@ from illuminerf.cues.surface_samples import CLIPPED_SRGB, RayCaster, SurfacePoin
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import linear_from_srgb
 from illuminerf.scene.meshes import TriangleMesh
-from illuminerf.scene.views import Views
+from illuminerf.scene.views import Views, spread_evenly
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.progress import track
 
@@ -70,7 +70,7 @@ def estimated_gloss(
         config: the settings.
         seed: of the paths.
     """
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), config.num_views)).round().astype(int)).tolist()
+    chosen = spread_evenly(len(views), config.num_views)
     shape = (len(chosen), len(points), 3)
     colours, diffuse, lobe = (np.full(shape, np.nan) for _ in range(3))
     rendered = render_cues(mesh, views.cameras, light, sampling, seed, chosen)

@@ -15,6 +15,7 @@ from scipy import ndimage
 from illuminerf.data.decoding import read_straight
 from illuminerf.data.source import SourceFrame
 from illuminerf.scene.images import linear_from_srgb, srgb_from_linear
+from illuminerf.scene.views import spread_evenly
 from illuminerf.workflow.errors import UserError
 
 MIN_TOLERANCE, MAX_TOLERANCE = 8 / 255, 32 / 255
@@ -55,7 +56,7 @@ def find_backdrop(frames: Sequence[SourceFrame]) -> Backdrop | None:
         UserError: it is not plain.
     """
     bare = [frame for frame in frames if frame.mask is None]
-    chosen = np.unique(np.linspace(0, max(len(bare) - 1, 0), min(len(bare), _VIEWS_ASKED)).round().astype(int))
+    chosen = spread_evenly(len(bare), _VIEWS_ASKED)
     images = (read_straight(bare[i].image, (bare[i].camera.width, bare[i].camera.height)) for i in chosen)
     opaque = [_border_pixels(image[..., :3]) for image in images if image[..., 3].min() == 1]
     return backdrop_of(opaque) if opaque else None

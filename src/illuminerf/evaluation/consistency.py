@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from illuminerf.scene.cameras import Cameras
+from illuminerf.scene.views import spread_evenly
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def neighbours(cameras: Cameras, num_pairs: int, least_radians: float = 0.1) -> 
     angle = np.arccos(np.clip(unit @ unit.T, -1, 1))
     np.fill_diagonal(angle, -1)
     pairs = []
-    for first in np.unique(np.linspace(0, len(cameras) - 1, min(num_pairs, len(cameras))).round().astype(int)):
+    for first in spread_evenly(len(cameras), num_pairs):
         others = np.where(angle[first] < least_radians, np.inf, angle[first])
         second = int(others.argmin()) if np.isfinite(others).any() else int(angle[first].argmax())
         if second != first:  # else there is one view only

@@ -36,7 +36,7 @@ def extract_mesh(
 ) -> TriangleMesh:
     """Marching cubes, with vertex normals that vary smoothly: highlights in the radiance cues follow them.
 
-    Deviation: the paper takes the predicted normals (supplement A.3). In fits of some thousand steps these are off by
+    Deviation: the paper takes the predicted normals (supplement A.2). In fits of some thousand steps these are off by
     more than the surface itself; instead its own, the gradients of the signed distance, are averaged over neighbours.
 
     Args:

@@ -10,6 +10,11 @@ from illuminerf.scene.cameras import Cameras
 from illuminerf.workflow.errors import UserError
 
 
+def spread_evenly(count: int, most: int) -> list[int]:
+    """At most so many of `count` things in order, the first and the last among them."""
+    return [int(number) for number in np.unique(np.linspace(0, count - 1, min(most, count)).round())]
+
+
 class EightBitImages:
     """A stack of images kept as bytes, a quarter of what floats take; what is indexed comes out as float32 in [0, 1].
 

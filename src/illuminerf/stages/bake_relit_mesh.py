@@ -11,6 +11,7 @@ from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.coloured_meshes import save_coloured_glb, save_coloured_ply, save_textured_glb
 from illuminerf.scene.meshes import TriangleMesh
 from illuminerf.scene.triangle_atlas import TriangleAtlas
+from illuminerf.scene.views import spread_evenly
 from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.atomic import read_json
 from illuminerf.workflow.device import resolve_device
@@ -68,7 +69,7 @@ def run(latent_nerf_path: Path, geometry_path: Path, capture_path: Path, config:
         count = config.num_samples
         stored.field.config = replace(stored.field.config, num_samples=count, num_proposal_samples=2 * count)
         cameras = Cameras.from_dict(read_json(capture_path / "cameras.json"))
-        chosen = np.unique(np.linspace(0, len(cameras) - 1, config.max_viewpoints).round().astype(int))
+        chosen = spread_evenly(len(cameras), config.max_viewpoints)
         viewpoints = cameras.positions[chosen]
         mesh = replace(mesh, vertex_colors=_colours(stored, mesh.vertices, viewpoints, config.num_directions))
         save_coloured_glb(out / "relit.glb", mesh)

@@ -1,4 +1,4 @@
-"""Capture -> Geometry: a signed distance field fitted to the images, and its mesh with predicted normals.
+"""Capture -> Geometry: a signed distance field fitted to the images, and its mesh with smooth normals.
 
 On several GPUs (or, through gloo, several CPU processes), which share the rays of every step and the folder:
 
@@ -26,7 +26,7 @@ from illuminerf.fields.shell import SurfaceShell, surface_shell
 from illuminerf.fields.storage import StoredField, save_field
 from illuminerf.fields.surface import surface_cells
 from illuminerf.scene.images import write_png
-from illuminerf.scene.views import Views
+from illuminerf.scene.views import Views, spread_evenly
 from illuminerf.workflow.device import derived_seed, torch_generator
 from illuminerf.workflow.errors import UserError
 from illuminerf.workflow.processes import Team, join, open_together
@@ -191,7 +191,7 @@ def _level(
     has_masks: bool,
     seed: int,
 ) -> float:
-    chosen = [fitted[i] for i in np.unique(np.linspace(0, len(fitted) - 1, _OUTLINE_VIEWS).round().astype(int))]
+    chosen = [fitted[i] for i in spread_evenly(len(fitted), _OUTLINE_VIEWS)]
     device = near_surface.cells.device
     pool = gather_rays(views.cameras[chosen], views.alphas(chosen), near_surface, device, 0.5)
     return outline_level(radiance_field, pool, has_masks, torch_generator(seed, "outlines", device=device))

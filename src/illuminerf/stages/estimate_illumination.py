@@ -23,7 +23,7 @@ from illuminerf.data.capture import load_capture
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import linear_from_srgb, read_exr, srgb_from_linear, write_exr, write_png
 from illuminerf.scene.meshes import TriangleMesh
-from illuminerf.scene.views import Views
+from illuminerf.scene.views import Views, spread_evenly
 from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.atomic import read_json, write_json
 from illuminerf.workflow.device import numpy_generator
@@ -121,8 +121,8 @@ def estimated_light(mesh: TriangleMesh, views: Views, config: Config) -> tuple[E
 def _preview(light: EnvironmentMap, views: Views, out: Path) -> np.ndarray:
     """sRGB [height, width, 3]: the light, then rows of photograph, shading, albedo."""
     rows = []
-    for view in np.unique(np.linspace(0, len(views) - 1, _PREVIEW_VIEWS).round().astype(int)):
-        channels = read_exr(shading_path(out, int(view)))
+    for view in spread_evenly(len(views), _PREVIEW_VIEWS):
+        channels = read_exr(shading_path(out, view))
         alpha = channels["A"][..., None]
         shading = np.stack([channels[name] for name in "RGB"], -1) / np.maximum(alpha, 1e-3)
         photograph, mask = views.srgb[view], views.alpha[view][..., None]

@@ -24,7 +24,7 @@ from illuminerf.fields.optimisation import OptimiserConfig, fit
 from illuminerf.scene.environment import EnvironmentMap
 from illuminerf.scene.images import srgb_from_linear, write_png
 from illuminerf.scene.meshes import TriangleMesh
-from illuminerf.scene.views import Views
+from illuminerf.scene.views import Views, spread_evenly
 from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.device import derived_seed, torch_generator
 
@@ -127,10 +127,10 @@ def _fit(found: FittedMaterials, mesh: TriangleMesh, views: Views, config: Confi
 def _preview(mesh: TriangleMesh, material: Material, light: EnvironmentMap, views: Views, config: Config) -> np.ndarray:
     """sRGB [height, width, 3]: rows of photograph, rendering, base colour, roughness, metallic."""
     scene, rows = ShadedScene([(mesh, material)], light, config.fit.device), []
-    for view in np.unique(np.linspace(0, len(views) - 1, _PREVIEW_VIEWS).round().astype(int)):
+    for view in spread_evenly(len(views), _PREVIEW_VIEWS):
         seed = derived_seed(config.seed, "preview", view)
-        rendered = scene.render(views.cameras, int(view), light, _PREVIEW_SAMPLES, seed)
-        stuff = scene.properties(views.cameras, int(view))
+        rendered = scene.render(views.cameras, view, light, _PREVIEW_SAMPLES, seed)
+        stuff = scene.properties(views.cameras, view)
         grey = [np.repeat(stuff[name][..., None], 3, -1) for name in ("roughness", "metallic")]
         shown = [views.srgb[view] * views.alpha[view][..., None]]
         shown += [srgb_from_linear(rendered[..., :3]), srgb_from_linear(stuff["base_color"]), *grey]

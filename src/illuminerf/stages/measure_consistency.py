@@ -27,7 +27,7 @@ from illuminerf.fields.shell import SurfaceShell, surface_shell
 from illuminerf.fields.storage import StoredField, load_field
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.images import read_png
-from illuminerf.scene.views import Views
+from illuminerf.scene.views import Views, spread_evenly
 from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.device import resolve_device
@@ -117,10 +117,10 @@ def _codes(
     if stored.latents is None or not shown:
         return {"codes_alpha": None, "codes_colour": None}
     count = len(stored.latents)
-    chosen = np.unique(np.linspace(0, count - 1, min(num_codes, count)).round().astype(int))
+    chosen = spread_evenly(count, num_codes)
     alphas, colours = [], []
     for view in shown:
-        images = [render_image(stored.field, shell, cameras, view, stored.latents[int(index)]) for index in chosen]
+        images = [render_image(stored.field, shell, cameras, view, stored.latents[index]) for index in chosen]
         mask = images[0].alpha > _COVERED
         alphas.append(mean_difference(np.stack([image.alpha for image in images]), np.ones_like(mask)))
         colours.append(mean_difference(np.stack([image.srgb for image in images]), mask))

@@ -30,6 +30,7 @@ from illuminerf.fields.surface import SurfaceField
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.images import read_exr, read_png, write_png
 from illuminerf.scene.meshes import TriangleMesh
+from illuminerf.scene.views import spread_evenly
 from illuminerf.workflow.artefact import open_artefact, read_metrics
 from illuminerf.workflow.atomic import read_json, write_json
 from illuminerf.workflow.device import numpy_generator, resolve_device
@@ -101,8 +102,8 @@ def run(source: Path, capture_path: Path, geometry: Path, novel_views: Path, con
         scores["num_faces"] = len(mesh.faces)
         scores["fit_seconds"] = read_metrics(geometry).get("fit_seconds", read_metrics(geometry)["seconds"])
         write_json(out / "scores.json", scores)
-        chosen = np.unique(np.linspace(0, len(views) - 1, config.num_sheet_views).round().astype(int))
-        write_png(out / "sheet.png", contact_sheet([views[int(view)] for view in chosen]))
+        chosen = spread_evenly(len(views), config.num_sheet_views)
+        write_png(out / "sheet.png", contact_sheet([views[view] for view in chosen]))
         artefact.finish({name: scores[name] for name in ("normal_degrees", "chamfer_percent", "psnr")})
     return out
 

@@ -38,7 +38,7 @@ from illuminerf.fields.surface import surface_cells
 from illuminerf.scene.cameras import Cameras
 from illuminerf.scene.images import write_png
 from illuminerf.scene.meshes import TriangleMesh, UpAxis
-from illuminerf.scene.views import Views
+from illuminerf.scene.views import Views, spread_evenly
 from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.device import derived_seed, resolve_device, torch_generator
 from illuminerf.workflow.errors import UserError
@@ -143,8 +143,8 @@ def _checked_overlap(mesh: TriangleMesh, capture: Capture, config: Config) -> fl
         return 1.0
     views, scene = capture.views, MeshScene(mesh, device=config.device)
     both = either = 0
-    for view in np.unique(np.linspace(0, len(views) - 1, _VIEWS_CHECKED).round().astype(int)):
-        drawn, mask = scene.normals(views.cameras, int(view))[1] > 0.5, views.alpha[view] > 0.5
+    for view in spread_evenly(len(views), _VIEWS_CHECKED):
+        drawn, mask = scene.normals(views.cameras, view)[1] > 0.5, views.alpha[view] > 0.5
         both, either = both + int((drawn & mask).sum()), either + int((drawn | mask).sum())
     overlap = both / max(either, 1)
     if overlap < config.least_overlap:
