@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from illuminerf.data.developing import shrunk
 from illuminerf.diffusion.relighting_model import save_model
 from illuminerf.evaluation.published import ABLATION
 from illuminerf.evaluation.tables import ablation_table
-from illuminerf.presets import Preset
+from illuminerf.presets import Preset, customised
 from illuminerf.scene.images import write_png
 from illuminerf.stages import measure_consistency
 from illuminerf.stages.relight_views import sample_path
@@ -141,3 +142,19 @@ def test_a_light_without_truth_is_refused_before_any_work(finished: tuple[Path, 
     with pytest.raises(UserError, match="no image under the light 'dawn'"):
         ablation.ablation_command(finished[0], Path(other), tmp_path / "run", (1,), device="cpu")
     assert not (tmp_path / "run").exists()
+
+
+def test_samples_can_be_asked_to_differ_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, asked = write_benchmark_scene(tmp_path), []
+
+    def noted(capture: Path, light: Path, rows: Any, views: Any, preset: Preset, *others: Any) -> dict[str, Any]:
+        asked.append(preset.relighting.temperature)
+        raise UserError("enough")
+
+    monkeypatch.setattr(ablation, "run", noted)
+    for temperature in (None, 1.0):
+        with pytest.raises(UserError, match="enough"):
+            ablation.ablation_command(
+                scene, LIGHT, tmp_path / "run", (1,), size=SIZE, temperature=temperature, device="cpu"
+            )
+    assert asked == [customised("embedded").relighting.temperature, 1.0] and asked[0] != 1.0

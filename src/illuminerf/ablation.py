@@ -81,6 +81,7 @@ def ablation_command(
     every: int = 1,
     pairs: int = 10,
     lpips: bool = False,
+    temperature: float | None = None,
     preset: str = "embedded",
     model: str | None = None,
     seed: int = 0,
@@ -102,6 +103,7 @@ def ablation_command(
         every: Use every n-th test view of a TensoIR scene.
         pairs: Pairs of neighbouring photographs whose relit images are compared.
         lpips: Also compute LPIPS, where the optional package is installed.
+        temperature: Of the relighting model's samples, where not the preset's: the higher, the more samples differ.
         preset: Settings of all stages: see `illuminerf presets`.
         model: Another relighting model than the preset's: a folder, embedded or dilightnet.
         seed: Of every random stream.
@@ -110,6 +112,8 @@ def ablation_command(
     if not samples or min(samples) < 1:
         raise UserError("nothing to compare", got=f"--samples {' '.join(map(str, samples))}", wanted="1 4 16")
     settings = customised(preset, samples=max(samples), size=size, seed=seed, device=device, model=model)
+    if temperature is not None:
+        settings = replace(settings, relighting=replace(settings.relighting, temperature=temperature))
     comparison = measure_consistency.Config(num_pairs=pairs, device=device)
     EnvironmentMap.load(light)
     views = _unseen_views(capture, light.stem, test_cameras, truth, size, every, out / "ablation" / light.stem)
