@@ -153,7 +153,7 @@ def fit(
     Args:
         step_loss: from the step to the loss (its mean over this process's share of the rays) and numbers to show. All
             randomness must derive from the step, and what it remembers be in `state`, which is what makes a resumed fit
-            equal to an uninterrupted one.
+            equal to an uninterrupted one (on CPUs). A `RecordableLoss` is faster on a GPU.
         checkpoint: where state is kept; the caller deletes it when the artefact is whole.
         start: called once before the first step, not on resume.
         team: whose first process writes checkpoints.
