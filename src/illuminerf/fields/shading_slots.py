@@ -15,8 +15,8 @@ class ShadingSlots:
 
     How many there are differs from step to step, and the device must be asked before tensors of that size are made. A
     step that is recorded and replayed (`recorded_steps`) cannot ask: it gets a fixed number of slots. Those left over
-    hold other samples with a weight of 0; where there are too few, `overflow` says so and the step is done again. Random
-    numbers by points are then as many as slots: with other capacities they are others, but as random.
+    hold other samples with a weight of 0; where there are too few, `overflow` says so and the step is done again.
+    Random numbers by points are then as many as slots: with another capacity they are others.
 
     Attributes:
         capacity: number of slots; None: as many as it takes.
