@@ -142,7 +142,8 @@ def mesh_settings(preset: Preset) -> use_mesh.Config:
     steps = max(1, of_preset.optimiser.num_steps // 5)
     optimiser = replace(of_preset.optimiser, num_steps=steps, warmup_steps=of_preset.optimiser.warmup_steps // 5)
     return use_mesh.Config(
-        radiance_field=of_preset.radiance_field,
+        # these follow the mesh's smooth normals, where gradients have its facets
+        radiance_field=replace(of_preset.radiance_field, radiance_normals="predicted"),
         optimiser=optimiser,
         occupancy_side=of_preset.occupancy_side,
         num_previews=of_preset.num_previews,

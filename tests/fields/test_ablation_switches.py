@@ -21,6 +21,7 @@ PARTS = {
     "no_proposal": {"has_proposal": False},
     "camera": {"appearance": AppearanceConfig(GRID, 8, 16, 1, 2, 4, 8, radiance="camera")},
     "reflected": {"appearance": AppearanceConfig(GRID, 8, 16, 1, 2, 4, 8, radiance="reflected")},
+    "predicted": {"radiance_normals": "predicted"},
     "shared": {"surface": SurfaceConfig(GRID, 16, HashGridConfig(2, 2, 9, 4, 8), has_normal_grid=False)},
 }
 
@@ -101,6 +102,42 @@ def test_every_kind_can_be_fitted_stored_and_loaded(part: str, tmp_path) -> None
     save_field(tmp_path, StoredField(field, cells))
     again = load_field(tmp_path).field
     torch.testing.assert_close(again.sample(*rays()).weights, field.sample(*rays()).weights, atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("kind", ["density", "predicted"])
+def test_colours_bend_the_normals_that_the_radiance_fields_see(kind: str) -> None:
+    """Density normals leave the photographs no other way to explain a highlight than to bend the surface."""
+    field = field_with({"density": "default"}.get(kind, kind))
+    assert field.config.radiance_normals == kind
+    origins, directions, near, far = rays()
+    points = field.worth_shading(field.sample(origins, directions, near, far))
+    points.weights = points.weights.detach()  # of colours, only the normals' way to the surface is left
+    field.shade(points, field.shading_normals(points), directions).sum().backward()
+    bent = {"density": field.surface.grid.table.grad, "predicted": field.surface.normal_grid.table.grad}  # type: ignore[union-attr]
+    assert bool(bent[kind].any())
+    assert all(gradient is None for name, gradient in bent.items() if name != kind)
+
+
+def test_smoothness_of_the_surface_straightens_it_and_nothing_else() -> None:
+    cameras = sphere_cameras(3, 2.5, 0.7, 8, 8, np.random.default_rng(0))
+    pool = gather_rays(cameras, np.ones((3, 8, 8), np.float32), OccupiedCells(torch.ones(8, 8, 8, dtype=torch.bool)))
+    target, index = torch.full((len(pool), 3), 0.5), torch.arange(64)
+
+    def loss_and_gradients(weight: float) -> tuple[float, dict[str, torch.Tensor]]:
+        field, config = field_with("default"), GeometryLossConfig(first_levels=1, surface_smoothness=weight)
+        with torch.no_grad():
+            field.surface.grid.table.normal_(0, 0.1, generator=torch.Generator().manual_seed(1))  # dents
+        levels = level_weights(field, config, torch.tensor(1.0))
+        generator = torch.Generator().manual_seed(0)
+        loss, _ = geometry_loss(field, config, pool, target, None, index, levels, generator)
+        loss.backward()
+        return float(loss.detach()), {n: p.grad.clone() for n, p in field.named_parameters() if p.grad is not None}
+
+    (without, plain), (once, gradients), (twice, _) = (loss_and_gradients(weight) for weight in (0.0, 0.5, 1.0))
+    assert once > without + 1e-3 and twice - without == pytest.approx(2 * (once - without), rel=1e-3)
+    changed = {name for name in plain if not torch.allclose(gradients[name], plain[name], rtol=1e-3, atol=1e-7)}
+    # weights and colours do not take part
+    assert changed == {"surface.grid.table", "surface.hidden.weight", "surface.hidden.bias", "surface.head.weight"}
 
 
 def test_without_coarse_to_fine_all_levels_are_on_from_the_second_step() -> None:

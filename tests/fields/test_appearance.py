@@ -90,7 +90,7 @@ def test_cached_colours_are_the_rendered_ones() -> None:
     origins, directions, near, far = pool.rays(index)
     samples = field.sample(origins, directions, near, far)
     points = field.worth_shading(samples)
-    _, normals = field.shading_normals(points)
+    normals = field.shading_normals(points)
     latents = torch.randn(40, 4, generator=torch.Generator().manual_seed(0))
     direct = field.shade(points, normals, directions, latents)
     assert float(direct.detach().max()) > 0.1

@@ -26,6 +26,7 @@ _CONFIG = FieldConfig(
     ProposalConfig(_GRID, 8),
     num_proposal_samples=32,
     num_samples=24,
+    radiance_normals="predicted",
 )
 _CELLS = OccupiedCells(torch.ones(16, 16, 16, dtype=torch.bool))
 _GREY_LEVEL = 1 / 255
@@ -101,8 +102,10 @@ def test_density_normals_are_used_where_the_field_wants_them(
     finally:
         field.config = _CONFIG
     reference = _as_trained(field, camera, num_samples=400, min_weight=0.0, radiance_normals="density")
-    error = _errors(marched, reference)["srgb"]
-    assert error < _GREY_LEVEL and error < 0.3 * _errors(predicted, reference)["srgb"]
+    errors, others = _errors(marched, reference), _errors(predicted, reference)
+    assert errors["srgb"] < _GREY_LEVEL and errors["srgb"] < 0.3 * others["srgb"]
+    # gradients turn within the soft shell, of which a march takes in one place
+    assert errors["normals"] < 0.05 and errors["normals"] < 0.3 * others["normals"]
 
 
 def test_no_cell_is_missed_and_none_is_met_too_early() -> None:

@@ -36,7 +36,7 @@ def surface_colours(
     device = next(field.parameters()).device
     eyes = torch.from_numpy(np.asarray(viewpoints, np.float32)).to(device)
     points = torch.from_numpy(np.ascontiguousarray(positions, np.float32)).to(device)
-    normals = field.surface.predicted_normals(points)
+    normals = field.shading_normals_at(points)
     towards = functional.normalize(eyes[None] - points[:, None], dim=-1)
     cosines, chosen = (towards * normals[:, None]).sum(-1).topk(min(num_directions, len(eyes)), dim=-1)
     weights = cosines.clamp_min(0.01).square()
@@ -58,6 +58,5 @@ def _short_rays(field: RadianceField, origins: Tensor, directions: Tensor, laten
     near = torch.zeros(len(origins), device=origins.device)
     samples = field.sample(origins, directions, near, near + 2 * _REACH)
     points = field.worth_shading(samples)
-    _, normals = field.shading_normals(points)
-    srgb = field.shade(points, normals, directions, latents)
+    srgb = field.shade(points, field.shading_normals(points), directions, latents)
     return (srgb / samples.weights.sum(-1, keepdim=True).clamp_min(1e-3)).clamp(0, 1)

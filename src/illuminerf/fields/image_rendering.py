@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from illuminerf.fields.appearance import blend_radiance
 from illuminerf.fields.bounds import OccupiedCells
@@ -26,7 +25,8 @@ class RenderedImage:
     Attributes:
         srgb: float32 [height, width, 3], premultiplied on black.
         alpha: float32 [height, width].
-        normals: float32 [height, width, 3], predicted normals in the world, weighted (length is about alpha).
+        normals: float32 [height, width, 3], the normals that the radiance fields see, in the world, weighted (length is
+            about alpha).
         depth: float32 [height, width], expected distance along the ray times alpha.
     """
 
@@ -124,13 +124,10 @@ def _marched(
 
 
 def _shaded(field: RadianceField, positions: Tensor, directions: Tensor, latent: Tensor | None) -> Tensor:
-    """What the appearance says of points, and their predicted normals: [points, 10]."""
-    predicted = field.surface.predicted_normals(positions)
-    normals = predicted
-    if field.config.radiance_normals == "density":
-        normals = functional.normalize(field.surface(positions).gradient, dim=-1, eps=1e-6)
+    """What the appearance says of points, and the normals that it saw: [points, 10]."""
+    normals = field.shading_normals_at(positions)
     latents = None if latent is None else latent.to(positions.device).expand(len(positions), -1)
-    return torch.cat([field.appearance(positions, directions, normals, latents), predicted], -1)
+    return torch.cat([field.appearance(positions, directions, normals, latents), normals], -1)
 
 
 @torch.no_grad()
@@ -164,10 +161,10 @@ def render_image_as_trained(
         origins, directions = origins[hit], directions[hit]
         samples = field.sample(origins, directions, near[hit], far[hit])
         points = field.worth_shading(samples)
-        predicted, shading = field.shading_normals(points)
+        shading = field.shading_normals(points)
         latents = None if latent is None else latent.to(device).expand(len(hit), -1)
         srgb = field.shade(points, shading, directions, latents)
-        normals = torch.zeros_like(srgb).index_add(0, points.ray, points.weights[:, None] * predicted)
+        normals = torch.zeros_like(srgb).index_add(0, points.ray, points.weights[:, None] * shading)
         distance = 0.5 * (samples.edges[:, 1:] + samples.edges[:, :-1])
         alpha = samples.weights.sum(-1, keepdim=True).clamp(0, 1)
         depth = (samples.weights * distance).sum(-1, keepdim=True)

@@ -206,8 +206,7 @@ def appearance_loss(
     origins, directions, near, far = pool.rays(index)
     samples = field.sample(origins, directions, near, far, StepDraws(generator, len(index)))
     points = field.worth_shading(samples)
-    _, normals = field.shading_normals(points)
-    srgb = field.shade(points, normals, directions)
+    srgb = field.shade(points, field.shading_normals(points), directions)
     total = losses.robust_colour_loss(srgb, target_srgb[index])
     total = total + interlevel_loss(samples.edges, samples.weights, samples.proposal_edges, samples.proposal_weights)
     return total, {"psnr": losses.psnr(losses.colour_loss(srgb.detach(), target_srgb[index]))}

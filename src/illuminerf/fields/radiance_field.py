@@ -37,8 +37,9 @@ class FieldConfig:
     """Samples per ray of the surface (64 for the paper preset)."""
     min_weight: float = 1e-3
     """Samples of smaller rendering weight are not shaded; 0 shades all."""
-    radiance_normals: Literal["predicted", "density"] = "predicted"
-    """Which normals the radiance fields see and reflect about."""
+    radiance_normals: Literal["density", "predicted"] = "density"
+    """Which normals the radiance fields see and reflect about. Deviation: UniSDF's are the predicted ones. Those bend
+    until highlights are explained, and the surface beneath is dented; the surface's own cannot, unless it bends too."""
     has_proposal: bool = True
     """False: no proposal round (supplement A.1), surface samples are spaced evenly, for comparison."""
 
@@ -78,6 +79,7 @@ class FieldConfig:
             num_proposal_samples=64,
             num_samples=64,
             min_weight=1e-4,
+            radiance_normals="predicted",
         )
 
 
@@ -200,16 +202,17 @@ class RadianceField(nn.Module):
         rendered = torch.zeros(len(directions), 7, device=values.device, dtype=values.dtype)
         return blend_radiance(rendered.index_add(0, points.ray, points.weights[:, None] * values))
 
-    def shading_normals(
-        self, points: ShadingPoints, level_weights: Float[Tensor, " levels"] | None = None
-    ) -> tuple[Float[Tensor, "points 3"], Float[Tensor, "points 3"]]:
-        """Predicted normals, and the normals that the radiance fields see."""
-        predicted = self.surface.predicted_normals(points.positions, level_weights)
-        return predicted, self.seen_normals(points, predicted)
+    def shading_normals(self, points: ShadingPoints) -> Float[Tensor, "points 3"]:
+        """Unit normals that the radiance fields see."""
+        if self.config.radiance_normals == "density":
+            return points.density_normals
+        return self.surface.predicted_normals(points.positions)
 
-    def seen_normals(self, points: ShadingPoints, predicted: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
-        """The normals that the radiance fields see."""
-        return predicted if self.config.radiance_normals == "predicted" else points.density_normals
+    def shading_normals_at(self, positions: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
+        """The same of points that were not sampled along rays."""
+        if self.config.radiance_normals == "density":
+            return functional.normalize(self.surface(positions).gradient, dim=-1, eps=1e-6)
+        return self.surface.predicted_normals(positions)
 
 
 def _crossing(distance: Tensor) -> Tensor:

@@ -95,7 +95,7 @@ def cache_shading(field: RadianceField, pool: RayPool, num_kept: int) -> Shading
             weights.reshape(-1),
             torch.nn.functional.normalize(samples.gradients.gather(1, spread), dim=-1, eps=1e-6).reshape(-1, 3),
         )
-        _, normals = field.shading_normals(flat)
+        normals = field.shading_normals(flat)
         cache.directions[index], cache.positions[index] = directions, positions
         cache.weights[index], cache.normals[index] = weights, normals.view_as(positions)
         distances = (positions[:, 0] - origins).norm(dim=-1)

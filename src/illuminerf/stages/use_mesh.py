@@ -10,7 +10,7 @@ from outside.
 """
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +51,10 @@ _VIEWS_CHECKED = 8
 class Config:
     """How a mesh becomes a geometry; the defaults are the embedded preset."""
 
-    radiance_field: FieldConfig = field(default_factory=FieldConfig.embedded)
-    """Sizes of the radiance field; those of later stages."""
+    radiance_field: FieldConfig = field(
+        default_factory=lambda: replace(FieldConfig.embedded(), radiance_normals="predicted")
+    )
+    """Sizes of the radiance field; those of later stages. Its predicted normals follow the mesh's smooth ones."""
     regression: SurfaceRegressionConfig = field(default_factory=SurfaceRegressionConfig)
     """Fit of signed distance and normals to the mesh."""
     optimiser: OptimiserConfig = field(default_factory=lambda: OptimiserConfig(num_steps=500))
