@@ -62,7 +62,6 @@ ABLATIONS: dict[str, Ablation] = {
     "symmetric_normal_loss": _with_losses(predicted_normals=_SYMMETRIC),
     "shared_normal_features": _shared_normal_features,
     "no_normal_smoothness": _with_losses(normal_smoothness=0.0),
-    "no_surface_smoothness": _with_losses(surface_smoothness=0.0),
     "predicted_radiance_normals": _with_field(radiance_normals="predicted"),
     "sphere_start": _with_losses(starts_from_hull=False),
     "black_background": _with_losses(random_background=False),

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional
 
 from illuminerf.fields import losses
 from illuminerf.fields.bounds import OccupiedCells, signed_distance_of_cells
@@ -40,8 +39,6 @@ class GeometryLossConfig:
     """lambda_1, lambda_2, lambda_3 of the asymmetric loss (supplement A.1)."""
     normal_smoothness: float = 0.1
     """lambda_4 (supplement A.1)."""
-    surface_smoothness: float = 0.1
-    """The same of the surface's own normals, which an even surface keeps from denting where it shines (ours)."""
     random_background: bool = True
     """Where there are masks, each ray and its pixel are laid over one colour, drawn anew at every step. False: over
     black, for comparison."""
@@ -99,21 +96,19 @@ def geometry_loss(
     draws = StepDraws(generator, len(index), team)
     batch, all_rays, index = len(index), index, index[draws.own]
     origins, directions, near, far = pool.rays(index)
-    rays = len(index)
 
     slots = slots or ShadingSlots()
     samples = field.sample(origins, directions, near, far, draws, levels.distance)
     points = field.worth_shading(samples, slots)
     # at once, so that the gradient of the table is made once
-    beside = points.positions + draws.normal(len(points.positions), 3) * config.smoothness_sigma
-    both = torch.cat([points.positions, beside])
+    noise = draws.normal(len(points.positions), 3) * config.smoothness_sigma
+    both = torch.cat([points.positions, points.positions + noise])
     predicted, perturbed = field.surface.predicted_normals(both, levels.normals).chunk(2)
     seen = points.density_normals if field.config.radiance_normals == "density" else predicted
     srgb = field.shade(points, seen, directions)
 
     anywhere = draws.uniform(3) * 1.6 - 0.8
-    elsewhere = torch.cat([anywhere, beside]) if config.surface_smoothness else anywhere
-    gradients_anywhere, gradients_beside = field.surface(elsewhere, levels.distance).gradient.tensor_split([rays])
+    gradients = torch.cat([samples.end_gradients.view(-1, 3), field.surface(anywhere, levels.distance).gradient])
 
     wanted = target_srgb[index]
     if target_alpha is not None and config.random_background:
@@ -125,9 +120,9 @@ def geometry_loss(
     squared = losses.colour_loss(srgb.detach(), wanted)
     if guide is not None:
         guide.update(all_rays, (srgb.detach() - wanted).abs().mean(-1), team, slots.overflow)
-    gradients = torch.cat([samples.end_gradients.view(-1, 3), gradients_anywhere])
     total = losses.robust_colour_loss(srgb, wanted) + config.eikonal * losses.eikonal_loss(gradients)
     total = total + interlevel_loss(samples.edges, samples.weights, samples.proposal_edges, samples.proposal_weights)
+    rays = len(index)
     total = total + config.orientation * losses.orientation_loss(
         points.weights, points.density_normals, directions[points.ray], rays
     )
@@ -135,11 +130,6 @@ def geometry_loss(
         points.weights, points.density_normals, predicted, rays, config.predicted_normals
     )
     total = total + config.normal_smoothness * losses.normal_smoothness_loss(points.weights, predicted, perturbed, rays)
-    if config.surface_smoothness:
-        normals_beside = functional.normalize(gradients_beside, dim=-1, eps=1e-6)
-        total = total + config.surface_smoothness * losses.normal_smoothness_loss(
-            points.weights.detach(), points.density_normals, normals_beside, rays
-        )
     if target_alpha is not None:
         total = total + config.mask * losses.mask_loss(samples.depth, target_alpha[index])
     return total, {"psnr": losses.psnr(team.mean(squared, batch)), "beta": field.surface.beta.detach()}

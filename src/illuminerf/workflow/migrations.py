@@ -12,7 +12,7 @@ from typing import Any
 
 from illuminerf.workflow.errors import UserError
 
-SCHEMA = 6
+SCHEMA = 5
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,6 @@ _NEW_FIELDS = (
     NewField(4, "estimate_geometry", "losses.guided_share", 0.0),
     NewField(4, "estimate_geometry", "outlines_set_level", False),
     NewField(5, "estimate_geometry", "mesh_normals", "predicted"),
-    NewField(6, "estimate_geometry", "losses.surface_smoothness", 0.0),
 )
 
 
