@@ -119,11 +119,10 @@ def _replaying(monkeypatch: pytest.MonkeyPatch, stepper: Stepper, steps: Recorda
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: stream)
     monkeypatch.setattr(torch.cuda, "stream", lambda chosen: nullcontext())
 
-    def record(recorded: RecordedSteps) -> bool:
+    def record(recorded: RecordedSteps) -> None:
         courses.append(recorded._tried)
         replay = lambda: setattr(recorded, "_row", recorded._computed())  # noqa: E731
         recorded._graph = SimpleNamespace(replay=replay)  # type: ignore[assignment]
-        return True
 
     courses: list[Any] = []
     monkeypatch.setattr(RecordedSteps, "_record", record)

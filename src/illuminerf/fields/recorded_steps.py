@@ -88,14 +88,11 @@ class RecordedSteps:
         """Launch steps of one course, without waiting for them."""
         for step in range(first, min(first + _BLOCK, end)):
             course = (self._prepare(step), self._loss.slots.capacity)
-            if not self._is_impossible and course == self._tried:
-                if self._graph is None and not self._record():
-                    self._prepare(step)
-                else:
-                    assert self._graph is not None
-                    self._graph.replay()
-                    yield self._row.clone()
-                    continue
+            if self._has_recording(course, step):
+                assert self._graph is not None
+                self._graph.replay()
+                yield self._row.clone()
+                continue
             if step > first:
                 return
             # what is compiled, loaded or cached at its first use must be so before a recording
@@ -107,8 +104,18 @@ class RecordedSteps:
             yield row
             return
 
-    def _record(self) -> bool:
-        """Whether a recording could be made; else none is tried again."""
+    def _has_recording(self, course: Hashable, step: int) -> bool:
+        """Of a course that has run before one is made where there is none yet. Else the step is ready to be launched."""
+        if self._is_impossible or course != self._tried:
+            return False
+        if self._graph is None:
+            self._record()
+            if self._graph is None:
+                self._prepare(step)
+        return self._graph is not None
+
+    def _record(self) -> None:
+        """Record what a step computes; where it cannot be, none is tried again."""
         try:
             graph = torch.cuda.CUDAGraph()
             graph.register_generator_state(self._loss.generator)
@@ -117,9 +124,8 @@ class RecordedSteps:
         except RuntimeError as error:
             say(f"steps are slower than they could be, as they cannot be recorded: {str(error).splitlines()[0]}")
             self._is_impossible, self._loss.slots.capacity = True, None
-            return False
-        self._graph = graph
-        return True
+        else:
+            self._graph = graph
 
     def _computed(self) -> Tensor:
         """What a step computes, in one tensor."""
