@@ -105,7 +105,7 @@ class RecordedSteps:
             return
 
     def _has_recording(self, course: Hashable, step: int) -> bool:
-        """Of a course that has run before one is made where there is none yet. Else the step is ready to be launched."""
+        """Of a course that has run before one is made where there is none. Else the step is ready to be launched."""
         if self._is_impossible or course != self._tried:
             return False
         if self._graph is None:
