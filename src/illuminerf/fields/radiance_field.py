@@ -38,8 +38,8 @@ class FieldConfig:
     min_weight: float = 1e-3
     """Samples of smaller rendering weight are not shaded; 0 shades all."""
     radiance_normals: Literal["density", "predicted"] = "density"
-    """Which normals the radiance fields see and reflect about. Deviation: UniSDF's are the predicted ones. Those bend
-    until highlights are explained, and the surface beneath is dented; the surface's own cannot, unless it bends too."""
+    """Which normals the radiance fields see and reflect about. Deviation: UniSDF's are the predicted ones, which can
+    bend to explain a highlight without the surface; beneath them it came out dented where it shines."""
     has_proposal: bool = True
     """False: no proposal round (supplement A.1), surface samples are spaced evenly, for comparison."""
 
