@@ -79,6 +79,21 @@ def test_zero_code_lies_between_the_samples(
     assert abs(dark - sample[sample.max(-1) > 0].mean()) < 0.05
 
 
+@pytest.mark.parametrize(("share", "is_mean"), [(CONFIG.zero_code_share, True), (0.0, False)])
+def test_the_zero_code_is_the_mean_of_the_samples(
+    geometry: Path, sphere_capture: Path, share: float, is_mean: bool, tmp_path: Path
+) -> None:
+    greys = (0.1, 0.2, 0.9)  # uneven: the code between them need not render their mean
+    for path in sorted((sphere_capture / "images").glob("*.png")):
+        for sample, grey in enumerate(greys):
+            even = np.repeat(grey * read_png(path)[..., 3:], 3, -1)
+            write_png(tmp_path / "relit" / "samples" / f"{path.stem}_{sample:02d}.png", even)
+    config = replace(CONFIG, zero_code_share=share)
+    fitted = fit_latent_nerf.run(geometry, sphere_capture, tmp_path / "relit", config, tmp_path / "nerf")
+    brightness = _brightness(fitted, sphere_capture, None, tmp_path / "views")
+    assert (abs(brightness - np.mean(greys)) < 0.02) == is_mean
+
+
 def test_colours_do_not_darken_where_mask_and_surface_disagree(
     geometry: Path, sphere_capture: Path, relit: Path, tmp_path: Path
 ) -> None:

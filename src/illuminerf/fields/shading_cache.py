@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from illuminerf.fields import losses
@@ -130,18 +130,27 @@ def latent_loss(
     team: Team = ALONE,
     batch: int = 0,
     slots: ShadingSlots | None = None,
+    is_coded: Bool[Tensor, "batch 1"] | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Equation 7 of the paper on one batch, or on a process's share of it.
+    """Equation 7 of the paper on one batch, or on a process's share of it; the PSNR is that of the rays with codes.
 
-    Deviation: a small penalty on the squared latents keeps the zero code, which is rendered at test, in their midst.
+    Deviation: rays with the zero code, and a small penalty on the squared latents, keep the zero code, which is
+    rendered at test, in their midst.
 
     Args:
         within_pixels: see `ShadingCache.render`.
         batch: rays of all processes together.
         slots: of the samples that are shaded.
+        is_coded: which rays see their latents; the others see the zero code. None: all do.
     """
-    colour = losses.colour_loss(cache.render(field, index, latents, within_pixels, slots), target_srgb)
-    total = colour
+    if is_coded is None:
+        is_coded = torch.ones_like(index[:, None], dtype=torch.bool)
+    if latents is not None:
+        latents = latents * is_coded
+    rendered = cache.render(field, index, latents, within_pixels, slots)
+    total = losses.colour_loss(rendered, target_srgb)
     if latents is not None:
         total = total + latent_penalty * latents.square().sum(-1).mean()
-    return total, {"psnr": losses.psnr(team.mean(colour.detach(), batch))}
+    squared = (rendered.detach() - target_srgb).square()
+    error, share = team.mean(torch.stack([(squared * is_coded).mean(), is_coded.to(squared.dtype).mean()]), batch)
+    return total, {"psnr": losses.psnr(error / share)}

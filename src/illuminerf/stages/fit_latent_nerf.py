@@ -50,6 +50,9 @@ class Config:
     check that they do explain something otherwise."""
     latent_penalty: float = 1e-4
     """Weight of the mean squared norm of the latent codes."""
+    zero_code_share: float = 0.5
+    """Share of each step's rays that see the zero code instead of their image's, so that the zero code, which is
+    rendered at test, stands for the mean of all samples."""
     seed: int = 0
     """Seed of latents, network and batches."""
     device: str = "auto"
@@ -58,13 +61,15 @@ class Config:
     def __post_init__(self) -> None:
         if min(self.num_kept, self.max_rays) < 1 or self.latent_penalty < 0:
             raise UserError("num_kept and max_rays must be positive, the penalty not negative", got=str(self))
+        if not 0 <= self.zero_code_share < 1:
+            raise UserError("zero_code_share is a share of the rays", got=f"{self.zero_code_share}", wanted="0 to 0.9")
         if self.shuffles_latents and not self.use_latents:
             raise UserError("there are no codes to shuffle", got="use_latents false", fix="leave shuffles_latents out")
 
     @classmethod
     def paper(cls) -> "Config":
         """The paper's settings."""
-        return cls(optimiser=OptimiserConfig.paper(), num_kept=16, max_rays=4_000_000)
+        return cls(optimiser=OptimiserConfig.paper(), num_kept=16, max_rays=4_000_000, zero_code_share=0.0)
 
 
 class _LatentNerf(nn.Module):
@@ -169,11 +174,15 @@ def _fit(
 
     Deviation: rays pass through random places of their pixels. Through the middles alone, hash cells finer than a pixel
     each learn the noise of a handful of samples, and unseen views are grainy.
+
+    Deviation: some rays see the zero code. Left to the penalty alone, it renders something else than the samples' mean,
+    and unseen views are further from the truth.
     """
     device = cache.weights.device
     num_samples, rays = len(targets), config.optimiser.rays_per_step
     own, slots, generator = team.own(rays), ShadingSlots(), torch.Generator(device)
     to_opacity = (cache.weights.sum(-1) / coverage.clamp_min(1e-3))[:, None]
+    is_coded = torch.arange(rays, device=device)[own, None] >= round(config.zero_code_share * rays)
     recent = torch.full((), torch.nan, dtype=torch.float64, device=device)
 
     def prepare(step: int) -> None:
@@ -192,7 +201,9 @@ def _fit(
             latents = model.latents.index_select(0, image)
         within = torch.rand(rays, 2, generator=generator, device=device)[own] - 0.5
         penalty = config.latent_penalty
-        total, numbers = latent_loss(radiance_field, cache, index, target, latents, penalty, within, team, rays, slots)
+        total, numbers = latent_loss(
+            radiance_field, cache, index, target, latents, penalty, within, team, rays, slots, is_coded
+        )
         found = numbers["psnr"].to(device)
         recent.copy_(torch.where(recent.isnan(), found, _RECENT_SHARE * recent + (1 - _RECENT_SHARE) * found))
         return total, {"psnr": recent}

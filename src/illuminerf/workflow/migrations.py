@@ -12,7 +12,7 @@ from typing import Any
 
 from illuminerf.workflow.errors import UserError
 
-SCHEMA = 5
+SCHEMA = 6
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ _NEW_FIELDS = (
     NewField(4, "estimate_geometry", "losses.guided_share", 0.0),
     NewField(4, "estimate_geometry", "outlines_set_level", False),
     NewField(5, "estimate_geometry", "mesh_normals", "predicted"),
+    NewField(6, "fit_latent_nerf", "zero_code_share", 0.0),
 )
 
 
