@@ -95,7 +95,9 @@ def test_the_true_mesh_scores_no_error_and_a_wrong_one_does(finished: Path, tmp_
     right = scored(finished, placed(1.0), tmp_path / "right")
     assert right["normal_degrees"] < 0.2 and right["chamfer_percent"] < 0.02 and right["mask_iou"] == 1
     assert right["f_score_half_percent"] == 1 and 0.5 < right["face_normal_degrees"] < 10
+    assert right["true_face_normal_degrees"] == pytest.approx(right["face_normal_degrees"], rel=0.02)
     wrong = scored(finished, placed(1.1), tmp_path / "wrong")
+    assert max(found["true_mesh_normal_degrees"] for found in (right, wrong)) < 0.2
     # 0.1 of the radius is 2.9 percent of the box's diagonal
     assert wrong["chamfer_percent"] == pytest.approx(100 * 0.1 / (2 * 3**0.5), rel=0.05)
     assert wrong["normal_degrees"] > 2 and wrong["mask_iou"] < 0.9 and wrong["f_score_1_percent"] == 0

@@ -95,9 +95,14 @@ def run(source: Path, capture_path: Path, geometry: Path, novel_views: Path, con
         whole_truth = area_surfels(truth, _AREA_POINTS, numpy_generator(config.seed, "truth"))
         scores["floater_share"] = floater_share(mesh, whole_truth, reach)
         scores |= _view_scores(views)
-        others = {"gradient": replace(mesh, vertex_normals=_gradients(geometry, config.device)), "face": None}
-        for name, smooth in others.items():
-            errors = _normal_errors(smooth or mesh, smooth is not None, source, views, config.device)
+        others = {
+            "gradient": (replace(mesh, vertex_normals=_gradients(geometry, config.device)), True),
+            "face": (mesh, False),
+            "true_mesh": (truth, True),
+            "true_face": (truth, False),
+        }
+        for name, (surface, is_smooth) in others.items():
+            errors = _normal_errors(surface, is_smooth, source, views, config.device)
             scores[f"{name}_normal_degrees"] = float(errors.mean())
         scores["num_faces"] = len(mesh.faces)
         scores["fit_seconds"] = read_metrics(geometry).get("fit_seconds", read_metrics(geometry)["seconds"])
@@ -171,7 +176,7 @@ def _scores_of(views: list[SurfaceView]) -> dict[str, float]:
 def _normal_errors(
     mesh: TriangleMesh, is_smooth: bool, source: Path, views: list[SurfaceView], device: str
 ) -> np.ndarray:
-    """Errors, in degrees, of other normals of the same surface over the same pixels."""
+    """Errors, in degrees, of other normals, or of another surface's, over the same pixels."""
     cameras = Cameras.from_dict(read_json(source / "test" / "cameras.json"))
     scene = MeshScene(mesh, is_smooth, device)
     errors = [
