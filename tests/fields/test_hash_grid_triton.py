@@ -1,39 +1,22 @@
 """The Triton kernels against the readable twin in float64, by Triton's interpreter where there is no GPU."""
 
 import importlib.util
-import inspect
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
 from illuminerf.fields import hash_grid
 from illuminerf.fields.hash_grid import HashGrid, interpolate
 from tests.fields.triton_cases import _OUTSIDE, CASES, Case, answers, eikonal_gradients
-
-ROOT = Path(__file__).parents[2]
-needs_triton = pytest.mark.skipif(
-    importlib.util.find_spec("triton") is None, reason="there is no triton (pip install triton; Linux only)"
-)
+from tests.fields.triton_processes import check_compiling, interpreted, needs_triton
 
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Tensor]]:
     """What the kernels answer, by case."""
-    out = tmp_path_factory.mktemp("triton") / "answers.safetensors"
-    environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(ROOT / "tests" / "fields" / "triton_cases.py"), str(out)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-3000:]
-    tensors: dict[str, dict[str, Tensor]] = {}
-    for name, value in load_file(out).items():
-        tensors.setdefault(name.split("/")[0], {})[name.split("/")[1]] = value
-    return tensors
+    return interpreted("triton_cases.py", tmp_path_factory.mktemp("triton"))
 
 
 def twin(grid: HashGrid, positions: Tensor, with_jacobian: bool) -> tuple[Tensor, Tensor]:
@@ -156,14 +139,4 @@ print("compiled")
 @pytest.mark.parametrize("state", ["good", "spoilt"])
 def test_kernels_compile_for_a_gpu_that_is_not_here(tmp_path: Path, state: str) -> None:
     """The interpreter takes more than the compiler does. Spoilt: blocks that are no power of two."""
-    from triton.compiler import ASTSource
-
-    if "constexprs" not in inspect.signature(ASTSource).parameters:
-        pytest.skip("this triton compiles by another interface")
-    environment = os.environ | {"PYTHONPATH": str(ROOT / "src"), "TRITON_CACHE_DIR": str(tmp_path)}
-    environment.pop("TRITON_INTERPRET", None)
-    (tmp_path / "compile_all.py").write_text(_COMPILE)  # triton reads the source of kernels from files
-    command = [sys.executable, str(tmp_path / "compile_all.py"), state]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert ("compiled" in done.stdout) == (state == "good"), done.stderr[-3000:]
-    assert state == "good" or "power of 2" in done.stderr
+    check_compiling(_COMPILE, state, tmp_path)

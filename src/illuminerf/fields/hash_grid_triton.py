@@ -63,6 +63,20 @@ def cells(positions, row, exists, resolution, half):
 
 @triton.jit
 @no_type_check
+def own_points(positions, table, levels, num_points, block: tl.constexpr):
+    """What a program works on: its level, the rows of its points, which exist, half the level's resolution, what
+    `entries` asks of their cells, and where in their cells they lie."""
+    level = tl.program_id(1)
+    resolution, offset, hash_mask, is_dense = level_of(levels, level)
+    point = tl.program_id(0) * block + tl.arange(0, block)
+    exists, row = point < num_points, point.to(tl.int64)
+    half = resolution.to(table.dtype.element_ty) * 0.5
+    x, y, z, fx, fy, fz = cells(positions, row, exists, resolution, half)
+    return level, row, exists, half, (x, y, z, resolution, offset, hash_mask, is_dense), (fx, fy, fz)
+
+
+@triton.jit
+@no_type_check
 def corner_weights(corner: tl.constexpr, fx, fy, fz):
     """Of one of a cell's eight corners, along each axis; bits of the number are x, y and z."""
     wx = fx if corner & 1 else 1 - fx
@@ -98,19 +112,14 @@ def _forward(
     with_jacobian: tl.constexpr,
     block: tl.constexpr,
 ):
-    level = tl.program_id(1)
-    resolution, offset, hash_mask, is_dense = level_of(levels, level)
-    point = tl.program_id(0) * block + tl.arange(0, block)
-    exists, row = point < num_points, point.to(tl.int64)
-    half = resolution.to(table.dtype.element_ty) * 0.5
-    x, y, z, fx, fy, fz = cells(positions, row, exists, resolution, half)
+    level, row, exists, half, cell, (fx, fy, fz) = own_points(positions, table, levels, num_points, block)
     feature = tl.arange(0, padded)
     kept = exists[:, None] & (feature < num_features)[None, :]
     value = tl.zeros((block, padded), table.dtype.element_ty)
     slope_x, slope_y, slope_z = value, value, value
     for corner in tl.static_range(8):
         wx, wy, wz = corner_weights(corner, fx, fy, fz)
-        entry = entries(corner, x, y, z, resolution, offset, hash_mask, is_dense)
+        entry = entries(corner, *cell)
         stored = tl.load(table + entry[:, None] * num_features + feature[None, :], mask=kept, other=0.0)
         value += (wx * wy * wz)[:, None] * stored
         if with_jacobian:
@@ -145,12 +154,7 @@ def _backward(
     with_jacobian: tl.constexpr,
     block: tl.constexpr,
 ):
-    level = tl.program_id(1)
-    resolution, offset, hash_mask, is_dense = level_of(levels, level)
-    point = tl.program_id(0) * block + tl.arange(0, block)
-    exists, row = point < num_points, point.to(tl.int64)
-    half = resolution.to(table_grad.dtype.element_ty) * 0.5
-    x, y, z, fx, fy, fz = cells(positions, row, exists, resolution, half)
+    level, row, exists, half, cell, (fx, fy, fz) = own_points(positions, table_grad, levels, num_points, block)
     feature = tl.arange(0, padded)
     kept = exists[:, None] & (feature < num_features)[None, :]
     column = (level * num_features + feature)[None, :]
@@ -164,7 +168,7 @@ def _backward(
         to_z = tl.load(start + 2 * axis_stride, mask=kept, other=0.0) * half
     for corner in tl.static_range(8):
         wx, wy, wz = corner_weights(corner, fx, fy, fz)
-        entry = entries(corner, x, y, z, resolution, offset, hash_mask, is_dense)
+        entry = entries(corner, *cell)
         share = (wx * wy * wz)[:, None] * to_value
         if with_jacobian:
             share += (wy * wz if corner & 1 else -(wy * wz))[:, None] * to_x

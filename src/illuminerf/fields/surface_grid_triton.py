@@ -9,7 +9,7 @@ from typing import no_type_check
 import triton
 import triton.language as tl
 
-from illuminerf.fields.hash_grid_triton import cells, corner_weights, entries, level_of
+from illuminerf.fields.hash_grid_triton import corner_weights, entries, own_points
 
 
 @triton.jit
@@ -44,12 +44,7 @@ def gather(
     is_slope: tl.constexpr,
     block: tl.constexpr,
 ):
-    level = tl.program_id(1)
-    resolution, offset, hash_mask, is_dense = level_of(levels, level)
-    point = tl.program_id(0) * block + tl.arange(0, block)
-    exists, row = point < num_points, point.to(tl.int64)
-    half = resolution.to(table.dtype.element_ty) * 0.5
-    x, y, z, fx, fy, fz = cells(positions, row, exists, resolution, half)
+    level, row, exists, half, cell, (fx, fy, fz) = own_points(positions, table, levels, num_points, block)
     if is_slope:
         gx, gy, gz = _direction(directions, row, exists, half)
     feature = tl.arange(0, padded)[None, :]
@@ -57,7 +52,7 @@ def gather(
     value = tl.zeros((block, padded), table.dtype.element_ty)
     for corner in tl.static_range(8):
         wx, wy, wz = corner_weights(corner, fx, fy, fz)
-        entry = entries(corner, x, y, z, resolution, offset, hash_mask, is_dense)
+        entry = entries(corner, *cell)
         stored = tl.load(table + entry[:, None] * num_features + feature, mask=kept, other=0.0)
         if is_slope:
             value += _slope_along(corner, wx, wy, wz, gx, gy, gz)[:, None] * stored
@@ -80,12 +75,7 @@ def slopes(
     padded: tl.constexpr,
     block: tl.constexpr,
 ):
-    level = tl.program_id(1)
-    resolution, offset, hash_mask, is_dense = level_of(levels, level)
-    point = tl.program_id(0) * block + tl.arange(0, block)
-    exists, row = point < num_points, point.to(tl.int64)
-    half = resolution.to(table.dtype.element_ty) * 0.5
-    x, y, z, fx, fy, fz = cells(positions, row, exists, resolution, half)
+    level, row, exists, half, cell, (fx, fy, fz) = own_points(positions, table, levels, num_points, block)
     feature = tl.arange(0, padded)[None, :]
     kept = exists[:, None] & (feature < num_features)
     first = level.to(tl.int64) * num_points
@@ -94,7 +84,7 @@ def slopes(
     slope_y, slope_z = slope_x, slope_x
     for corner in tl.static_range(8):
         wx, wy, wz = corner_weights(corner, fx, fy, fz)
-        entry = entries(corner, x, y, z, resolution, offset, hash_mask, is_dense)
+        entry = entries(corner, *cell)
         stored = tl.load(table + entry[:, None] * num_features + feature, mask=kept, other=0.0)
         share = tl.sum(weight * stored, axis=1) * half
         slope_x += wy * wz * share if corner & 1 else -(wy * wz * share)
@@ -120,12 +110,7 @@ def scatter(
     padded: tl.constexpr,
     block: tl.constexpr,
 ):
-    level = tl.program_id(1)
-    resolution, offset, hash_mask, is_dense = level_of(levels, level)
-    point = tl.program_id(0) * block + tl.arange(0, block)
-    exists, row = point < num_points, point.to(tl.int64)
-    half = resolution.to(table_grad.dtype.element_ty) * 0.5
-    x, y, z, fx, fy, fz = cells(positions, row, exists, resolution, half)
+    level, row, exists, half, cell, (fx, fy, fz) = own_points(positions, table_grad, levels, num_points, block)
     gx, gy, gz = _direction(directions, row, exists, half)
     feature = tl.arange(0, padded)[None, :]
     kept = exists[:, None] & (feature < num_features)
@@ -134,7 +119,7 @@ def scatter(
     to_slope = tl.load(by_feature + place, mask=kept, other=0.0)
     for corner in tl.static_range(8):
         wx, wy, wz = corner_weights(corner, fx, fy, fz)
-        entry = entries(corner, x, y, z, resolution, offset, hash_mask, is_dense)
+        entry = entries(corner, *cell)
         share = (wx * wy * wz)[:, None] * to_value
         share += _slope_along(corner, wx, wy, wz, gx, gy, gz)[:, None] * to_slope
         tl.atomic_add(table_grad + entry[:, None] * num_features + feature, share, mask=kept, sem="relaxed")
