@@ -62,7 +62,7 @@ class Config:
         if min(self.num_kept, self.max_rays) < 1 or self.latent_penalty < 0:
             raise UserError("num_kept and max_rays must be positive, the penalty not negative", got=str(self))
         if not 0 <= self.zero_code_share < 1:
-            raise UserError("zero_code_share is a share of the rays", got=f"{self.zero_code_share}", wanted="0 up to below 1")
+            raise UserError("zero_code_share is a share of the rays", got=f"{self.zero_code_share}", wanted="below 1")
         if self.shuffles_latents and not self.use_latents:
             raise UserError("there are no codes to shuffle", got="use_latents false", fix="leave shuffles_latents out")
 
