@@ -45,7 +45,7 @@ def _cell(positions, row, exists, axis: tl.constexpr, half, last):
 
 @triton.jit
 @no_type_check
-def level_of(levels, level):
+def _level_of(levels, level):
     """Resolution, first entry, hash mask, stored densely or not, of a row of `level_rows`."""
     row = levels + level * 4
     return tl.load(row), tl.load(row + 1), tl.load(row + 2).to(tl.uint32), tl.load(row + 3) != 0
@@ -53,7 +53,7 @@ def level_of(levels, level):
 
 @triton.jit
 @no_type_check
-def cells(positions, row, exists, resolution, half):
+def _cells(positions, row, exists, resolution, half):
     """The cells that points lie in, and where in them, from 0 to 1 along each axis."""
     x, fx = _cell(positions, row, exists, 0, half, resolution - 1)
     y, fy = _cell(positions, row, exists, 1, half, resolution - 1)
@@ -67,11 +67,11 @@ def own_points(positions, table, levels, num_points, block: tl.constexpr):
     """What a program works on: its level, the rows of its points, which exist, half the level's resolution, what
     `entries` asks of their cells, and where in their cells they lie."""
     level = tl.program_id(1)
-    resolution, offset, hash_mask, is_dense = level_of(levels, level)
+    resolution, offset, hash_mask, is_dense = _level_of(levels, level)
     point = tl.program_id(0) * block + tl.arange(0, block)
     exists, row = point < num_points, point.to(tl.int64)
     half = resolution.to(table.dtype.element_ty) * 0.5
-    x, y, z, fx, fy, fz = cells(positions, row, exists, resolution, half)
+    x, y, z, fx, fy, fz = _cells(positions, row, exists, resolution, half)
     return level, row, exists, half, (x, y, z, resolution, offset, hash_mask, is_dense), (fx, fy, fz)
 
 
