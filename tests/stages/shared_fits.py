@@ -3,9 +3,11 @@
     shared_fits.py CAPTURE RELIT OUT         both stages; geometry is stopped and gone on with on the way
     shared_fits.py CAPTURE RELIT OUT dies    the last process ends without a word in the third step
 
-The first process writes OUT/<stage>.json, the losses by step, beside the artefacts.
+The first process writes OUT/<stage>.json, the losses by step, beside the artefacts. Each process writes OUT/ended_<its
+number>.json as it ends: whether the process group was closed by then.
 """
 
+import atexit
 import json
 import os
 import sys
@@ -15,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
-from torch import Tensor
+from torch import Tensor, distributed
 
 from illuminerf.fields.optimisation import OptimiserConfig
 from illuminerf.stages import estimate_geometry, fit_latent_nerf
@@ -95,8 +97,15 @@ def _write(path: Path, losses: list[float]) -> None:
     losses.clear()
 
 
+def writes_how_it_ended(out: Path) -> None:
+    """Called last as this process ends: functions that end a process run in the reverse order of their registration."""
+    is_closed = not distributed.is_initialized()
+    (out / f"ended_{os.environ['RANK']}.json").write_text(json.dumps(is_closed))
+
+
 if __name__ == "__main__":
     folders = [Path(argument) for argument in sys.argv[1:4]]
+    atexit.register(writes_how_it_ended, folders[2])
     if "dies" not in sys.argv:
         fits(*folders)
     elif os.environ["RANK"] == "0":

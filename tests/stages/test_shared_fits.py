@@ -91,6 +91,11 @@ def test_a_mean_of_means_is_noticed(two: Path, one: tuple[Path, dict[str, list]]
     assert furthest(two / "wrong", one[0] / "geometry") > 1e-3
 
 
+def test_the_group_is_closed_before_the_interpreter_ends(two: Path) -> None:
+    """A thread of an open one would abort the process now and then, long after its work was done."""
+    assert [json.loads((two / f"ended_{rank}.json").read_text()) for rank in range(2)] == [True, True]
+
+
 def test_a_dead_process_leaves_no_other_waiting(sphere_capture: Path, relit: Path, tmp_path: Path) -> None:
     """Without torchrun, which would end the other one too."""
     with socket.socket() as free:
@@ -109,6 +114,7 @@ def test_a_dead_process_leaves_no_other_waiting(sphere_capture: Path, relit: Pat
             process.kill()
     assert processes[0].returncode not in (0, -9) and "another process of this run has ended" in said
     assert not (tmp_path / "geometry" / "DONE").exists()
+    assert not json.loads((tmp_path / "ended_0.json").read_text()), "who waits for a dead process may wait for ever"
 
 
 def test_shares_cover_everything_once() -> None:

@@ -38,7 +38,7 @@ from illuminerf.workflow.artefact import open_artefact
 from illuminerf.workflow.atomic import write_json
 from illuminerf.workflow.device import autocast, resolve_device
 from illuminerf.workflow.metrics_log import MetricsLog
-from illuminerf.workflow.processes import sum_over_processes
+from illuminerf.workflow.processes import closed_at_exit, sum_over_processes
 from illuminerf.workflow.progress import StepProgress, say, step_progress
 
 __all__ = ["Config", "ExecutionConfig", "MonitoringConfig", "Phase", "run"]
@@ -47,6 +47,7 @@ _CHECKPOINT = "training.safetensors"
 _GRID_ROWS = ("input", "diffuse_cue", "truth", "anchor", "sample", "mean", "bound")
 
 
+@closed_at_exit()
 def run(pairs: str | Path, held_out: str | Path, config: Config, out: Path) -> Path:
     """Train on the items of `pairs`, validate on those of `held_out`; `out` becomes a model folder.
 

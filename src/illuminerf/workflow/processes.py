@@ -3,6 +3,7 @@
 A launcher (torchrun, accelerate launch) tells each process its number in RANK and the count in WORLD_SIZE.
 """
 
+import atexit
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -170,6 +171,23 @@ def join(device: str) -> tuple[Team, torch.device]:
     return Team(index, count), place
 
 
+def _close_group() -> None:
+    if distributed.is_available() and distributed.is_initialized():
+        distributed.destroy_process_group()
+
+
+@contextmanager
+def closed_at_exit() -> Iterator[None]:
+    """Work of a process group, which is closed when this process ends, unless the work failed.
+
+    Gloo's threads let go of a sum's tensors a while after the sum is known; one that does so while the interpreter
+    shuts down aborts a process whose work is done. After a failure nothing is closed: others may never answer.
+    """
+    atexit.unregister(_close_group)
+    yield
+    atexit.register(_close_group)
+
+
 @contextmanager
 def open_together(team: Team, out: Path, stage: str, config: Any, inputs: dict[str, Path | str]) -> Iterator[Artefact]:
     """`open_artefact` for a team: the first process opens and writes it; the others wait for it at the end.
@@ -179,13 +197,14 @@ def open_together(team: Team, out: Path, stage: str, config: Any, inputs: dict[s
     Raises:
         UserError: as `open_artefact`; or `out` is not finished at the end, or not seen by a process.
     """
-    if team.is_first:
-        with open_artefact(out, stage, config, inputs) as artefact:
-            team.agreed(artefact.is_done)
-            yield artefact
-        team.agreed(True)
-        return
-    is_done = team.agreed(False)
-    yield Artefact(out, stage, is_done, finished=is_done)
-    team.agreed(False)
-    fingerprint(out)
+    with closed_at_exit():
+        if team.is_first:
+            with open_artefact(out, stage, config, inputs) as artefact:
+                team.agreed(artefact.is_done)
+                yield artefact
+            team.agreed(True)
+            return
+        is_done = team.agreed(False)
+        yield Artefact(out, stage, is_done, finished=is_done)
+        team.agreed(False)
+        fingerprint(out)
