@@ -98,6 +98,42 @@ def test_without_the_curvature_of_the_softplus_the_gradient_is_another_one() -> 
     assert float((found[0] - found[1]).abs().max()) > 0.02 * float(found[0].abs().max())
 
 
+def _elsewhere(tensor: Tensor, offset: int) -> Tensor:
+    """The same numbers at another place in memory."""
+    buffer = tensor.new_empty(tensor.numel() + 64)
+    return buffer[offset : offset + tensor.numel()].view(tensor.shape).copy_(tensor)
+
+
+def test_result_does_not_depend_on_where_arrays_lie() -> None:
+    """Loops that ran as vectors for some addresses only would round in two ways."""
+    surface, positions = _surface(), _positions(1000)
+    generator = torch.Generator().manual_seed(2)
+    incoming = torch.randn(1000, generator=generator), torch.randn(1000, 3, generator=generator)
+    found = []
+    for offset in range(0, 60, 3):
+        kept = [torch.empty(1000 + 100 * offset) for _ in range(offset % 7)]  # so that temporary arrays move too
+        places, weights = _elsewhere(positions, offset), _elsewhere(torch.ones(4), offset)
+        point = surface(places, weights)
+        grads = [_elsewhere(each, offset) for each in incoming]
+        gradients = torch.autograd.grad(point, _parameters(surface), grads)
+        features = surface.grid(places)
+        of_table = torch.autograd.grad(features, surface.grid.table, _elsewhere(torch.ones_like(features), offset))
+        found.append([*point, *gradients, features, *of_table])
+        del kept
+    for other in found[1:]:
+        assert all(torch.equal(one, another) for one, another in zip(found[0], other, strict=True))
+
+
+@pytest.mark.parametrize("count", [1, 15, 64, 65, 300])
+def test_a_point_does_not_depend_on_the_others(count: int) -> None:
+    surface, positions = _surface(), _positions()
+    together = surface(positions, _LEVELS)
+    apart = [surface(part, _LEVELS) for part in positions.split(count)]
+    assert torch.equal(together.signed_distance, torch.cat([part.signed_distance for part in apart]))
+    assert torch.equal(together.gradient, torch.cat([part.gradient for part in apart]))
+    assert torch.equal(surface.grid(positions), torch.cat([surface.grid(part) for part in positions.split(count)]))
+
+
 def _digest() -> str:
     """Of the surface's values and all gradients at some positions."""
     surface, positions = _surface(), _positions(1000)

@@ -1,13 +1,14 @@
 """Signed distance and its gradient on a CPU, in numba: hash grid, hidden layer and both derivatives in one operation.
 
-The fast twin of `SurfaceField.residual`. What it saves over separate ones is traffic of memory: the hash grid writes
-its Jacobian level by level in one stretch each, and the gradient that would reach it, of the same size, is never
-formed, since it is an outer product (eikonal and normal losses see only `by_feature @ J`).
+The fast twin of `SurfaceField.residual`. What it saves over separate ones is traffic of memory: everything lies with
+the points last, as the hash grid's kernels leave it; the layers take blocks of points whose numbers stay in the cache;
+and the gradient that would reach the Jacobian, of the same size, is never formed, since it is an outer product
+(eikonal and normal losses see only `by_feature @ J`).
 
-Letters: h hidden units, f features, i axes; W [f, h] first layer, w [h] last layer, s slope of the softplus,
-    distance   = w . softplus(W^T x + b) + bias          gradient_i = sum_f p_f J_fi,   p_f = sum_h W_fh s_h w_h
-and with incoming g (distance) and v_i (gradient), q_f = sum_i J_fi v_i, r_h = sum_f W_fh q_f:
-    d/d pre_h = w_h (s_h g + s'_h r_h),  d/d W_fh = x_f d/d pre_h + q_f s_h w_h,  d/d x_f = sum_h W_fh d/d pre_h,
+Letters: h hidden units, f features, i axes; W [h, f] first layer, w [h] last layer, s slope of the softplus,
+    distance   = w . softplus(W x + b) + bias            gradient_i = sum_f p_f J_fi,   p_f = sum_h W_hf s_h w_h
+and with incoming g (distance) and v_i (gradient), q_f = sum_i J_fi v_i, r_h = sum_f W_hf q_f:
+    d/d pre_h = w_h (s_h g + s'_h r_h),  d/d W_hf = x_f d/d pre_h + q_f s_h w_h,  d/d x_f = sum_h W_hf d/d pre_h,
     d/d J_fi  = p_f v_i.
 Points are split into a fixed number of parts whose sums are added in order: the result does not depend on threads.
 """
@@ -20,9 +21,11 @@ from numba import njit, prange
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from illuminerf.fields.hash_grid_kernel import FAST, grid_backward_outer, grid_forward, half_resolutions
+from illuminerf.fields.hash_grid_kernel import FAST, grid_backward, grid_forward, kernel_levels
 
 _NUM_PARTS = 16
+_BLOCK = 128
+_MULTIPLE = 4  # that widths are filled up to with zeros: products go by two rows and four columns
 
 _SHARPNESS = np.float32(100.0)
 _ZERO, _ONE, _TWO, _LARGEST = np.float32(0), np.float32(1), np.float32(2), np.float32(24)
@@ -51,96 +54,158 @@ def softplus_with_slope(value):
     return max(value, _ZERO) + log1p / _SHARPNESS, slope
 
 
-@njit(parallel=True, cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=FAST)
 @no_type_check
-def _forward_layers(features, jacobian, first, bias, last, by_feature, hidden, slope, distance, gradient):
-    num_levels, num_features, num_hidden = first.shape
-    for n in prange(features.shape[0]):
-        h, s = hidden[n], slope[n]
-        for k in range(num_hidden):
-            h[k] = bias[k]
-        for level in range(num_levels):
-            for f in range(num_features):
-                value = features[n, level, f]
-                for k in range(num_hidden):
-                    h[k] += value * first[level, f, k]
-        total = _ZERO
-        for k in range(num_hidden):
-            h[k], s[k] = softplus_with_slope(h[k])
-            total += h[k] * last[k]
-        gx = gy = gz = _ZERO
-        for level in range(num_levels):
-            for f in range(num_features):
-                value = _ZERO
-                for k in range(num_hidden):
-                    value += first[level, f, k] * (s[k] * last[k])
-                by_feature[n, level, f] = value
-                gx += value * jacobian[n, level, f, 0]
-                gy += value * jacobian[n, level, f, 1]
-                gz += value * jacobian[n, level, f, 2]
-        distance[n] = total
-        gradient[n, 0], gradient[n, 1], gradient[n, 2] = gx, gy, gz
+def _product(weight, x, out):
+    """out [rows, block] = weight [rows, columns] @ x [columns, block]."""
+    for r in range(0, weight.shape[0], 2):
+        for n in range(_BLOCK):
+            out[r, n] = out[r + 1, n] = _ZERO
+        for c in range(0, weight.shape[1], 4):
+            a0, a1, a2, a3 = weight[r, c], weight[r, c + 1], weight[r, c + 2], weight[r, c + 3]
+            b0, b1, b2, b3 = weight[r + 1, c], weight[r + 1, c + 1], weight[r + 1, c + 2], weight[r + 1, c + 3]
+            for n in range(_BLOCK):
+                x0, x1, x2, x3 = x[c, n], x[c + 1, n], x[c + 2, n], x[c + 3, n]
+                out[r, n] += a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
+                out[r + 1, n] += b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
+
+
+@njit(cache=True, fastmath=FAST)
+@no_type_check
+def _add_outer(x, y, out):
+    """out [rows, columns] += x [rows, block] @ y [columns, block]^T."""
+    for r in range(0, out.shape[0], 2):
+        for c in range(0, out.shape[1], 4):
+            a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = _ZERO
+            for n in range(_BLOCK):
+                a, b = x[r, n], x[r + 1, n]
+                y0, y1, y2, y3 = y[c, n], y[c + 1, n], y[c + 2, n], y[c + 3, n]
+                a0, a1, a2, a3 = a0 + a * y0, a1 + a * y1, a2 + a * y2, a3 + a * y3
+                b0, b1, b2, b3 = b0 + b * y0, b1 + b * y1, b2 + b * y2, b3 + b * y3
+            out[r, c] += a0
+            out[r, c + 1] += a1
+            out[r, c + 2] += a2
+            out[r, c + 3] += a3
+            out[r + 1, c] += b0
+            out[r + 1, c + 1] += b1
+            out[r + 1, c + 2] += b2
+            out[r + 1, c + 3] += b3
+
+
+@njit(cache=True, fastmath=FAST)
+@no_type_check
+def _fill(source, out):
+    """Copy a row [points] into one of a block, whose rest is zero."""
+    for n in range(len(source)):
+        out[n] = source[n]
+    for n in range(len(source), len(out)):
+        out[n] = _ZERO
+
+
+@njit(cache=True, fastmath=FAST)
+@no_type_check
+def _add_scaled(x, factor, out):
+    for n in range(len(out)):
+        out[n] += x[n] * factor
+
+
+@njit(cache=True, fastmath=FAST)
+@no_type_check
+def _add_multiplied(x, y, out):
+    for n in range(len(y)):
+        out[n] += x[n] * y[n]
+
+
+@njit(cache=True, fastmath=FAST)
+@no_type_check
+def _chain(hidden, slope, of_distance, last, pre, scaled):
+    """What comes back through one hidden unit: `pre` holds r and becomes the gradient before the softplus, `scaled`
+    becomes s w; returns the gradients of the last layer's weight and of the bias."""
+    of_last = of_bias = _ZERO
+    for n in range(len(pre)):
+        s, r, g = slope[n], pre[n], of_distance[n]
+        of_last += g * hidden[n] + s * r
+        scaled[n] = s * last
+        pre[n] = last * (s * g + _SHARPNESS * s * (_ONE - s) * r)
+        of_bias += pre[n]
+    return of_last, of_bias
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")  # Python's would ask of every divisor whether it is zero
+@no_type_check
+def _activate(bias, hidden, slope):
+    for k in range(hidden.shape[0]):
+        for n in range(_BLOCK):
+            hidden[k, n], slope[k, n] = softplus_with_slope(hidden[k, n] + bias[k])
 
 
 @njit(parallel=True, cache=True, fastmath=FAST)
 @no_type_check
-def _distance_layers(features, first, bias, last, distance):
-    num_levels, num_features, num_hidden = first.shape
-    num_parts = _NUM_PARTS
-    for part in prange(num_parts):
-        h = np.empty(num_hidden, np.float32)
-        for n in range(part * len(distance) // num_parts, (part + 1) * len(distance) // num_parts):
+def _forward_layers(features, jacobian, first, weighted, bias, last, hidden, slope, by_feature, distance, gradient):
+    """All with the points last but `gradient` [points, 3]; `weighted` is W^T w. Without a Jacobian only the distance is
+    computed."""
+    (num_columns, num_points), (num_hidden, width) = features.shape, first.shape
+    with_gradient = jacobian.size > 0
+    for part in prange(_NUM_PARTS):
+        x, p = np.zeros((width, _BLOCK), np.float32), np.empty((width, _BLOCK), np.float32)
+        h, s = np.empty((num_hidden, _BLOCK), np.float32), np.empty((num_hidden, _BLOCK), np.float32)
+        total = np.empty((4, _BLOCK), np.float32)
+        stop = (part + 1) * num_points // _NUM_PARTS
+        for start in range(part * num_points // _NUM_PARTS, stop, _BLOCK):
+            end = min(start + _BLOCK, stop)
+            for c in range(num_columns):
+                _fill(features[c, start:end], x[c])
+            _product(first, x, h)
+            _activate(bias, h, s)
+            total[:] = _ZERO
             for k in range(num_hidden):
-                h[k] = bias[k]
-            for level in range(num_levels):
-                for f in range(num_features):
-                    value = features[n, level, f]
-                    for k in range(num_hidden):
-                        h[k] += value * first[level, f, k]
-            total = _ZERO
+                _add_scaled(h[k], last[k], total[0])
+            distance[start:end] = total[0, : end - start]
+            if not with_gradient:
+                continue
             for k in range(num_hidden):
-                softplus, _ = softplus_with_slope(h[k])
-                total += softplus * last[k]
-            distance[n] = total
+                hidden[k, start:end], slope[k, start:end] = h[k, : end - start], s[k, : end - start]
+            _product(weighted, s, p)
+            for c in range(num_columns):
+                by_feature[c, start:end] = p[c, : end - start]
+                for axis in range(3):
+                    _add_multiplied(p[c], jacobian[c, axis, start:end], total[axis + 1])
+            gradient[start:end] = total[1:, : end - start].T
 
 
 @njit(parallel=True, cache=True, fastmath=FAST)
 @no_type_check
 def _backward_layers(
-    features, jacobian, hidden, slope, first, last, distance_grad, gradient_grad,
+    features, jacobian, hidden, slope, first, transposed, last, distance_grad, gradient_grad,
     features_grad, first_grads, bias_grads, last_grads,
 ):  # fmt: skip
-    num_points, (num_levels, num_features, num_hidden) = features.shape[0], first.shape
-    num_parts = first_grads.shape[0]
-    for part in prange(num_parts):
-        first_grad, bias_grad, last_grad = first_grads[part], bias_grads[part], last_grads[part]
-        pre = np.empty(num_hidden, np.float32)
-        scaled = np.empty(num_hidden, np.float32)
-        q = np.empty((num_levels, num_features), np.float32)
-        for n in range(part * num_points // num_parts, (part + 1) * num_points // num_parts):
-            g, vx, vy, vz = distance_grad[n], gradient_grad[n, 0], gradient_grad[n, 1], gradient_grad[n, 2]
-            h, s = hidden[n], slope[n]
+    """With the points last, `gradient_grad` [3, points] too; sums of every part by themselves."""
+    (num_columns, num_points), (num_hidden, width) = features.shape, first.shape
+    for part in prange(_NUM_PARTS):
+        x, q = np.zeros((width, _BLOCK), np.float32), np.zeros((width, _BLOCK), np.float32)
+        pre, scaled = np.empty((num_hidden, _BLOCK), np.float32), np.empty((num_hidden, _BLOCK), np.float32)
+        g, h, s = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
+        stop = (part + 1) * num_points // _NUM_PARTS
+        for start in range(part * num_points // _NUM_PARTS, stop, _BLOCK):
+            end = min(start + _BLOCK, stop)
+            for c in range(num_columns):
+                _fill(features[c, start:end], x[c])
+                q[c] = _ZERO
+                for axis in range(3):
+                    _add_multiplied(gradient_grad[axis, start:end], jacobian[c, axis, start:end], q[c])
+            _product(first, q, pre)
+            _fill(distance_grad[start:end], g)
             for k in range(num_hidden):
-                pre[k] = _ZERO
-            for level in range(num_levels):
-                for f in range(num_features):
-                    jx, jy, jz = jacobian[n, level, f, 0], jacobian[n, level, f, 1], jacobian[n, level, f, 2]
-                    q[level, f] = jx * vx + jy * vy + jz * vz
-                    for k in range(num_hidden):
-                        pre[k] += q[level, f] * first[level, f, k]
-            for k in range(num_hidden):
-                r = pre[k]
-                last_grad[k] += g * h[k] + s[k] * r
-                scaled[k] = s[k] * last[k]
-                pre[k] = last[k] * (s[k] * g + _SHARPNESS * s[k] * (_ONE - s[k]) * r)
-                bias_grad[k] += pre[k]
-            for level in range(num_levels):
-                for f in range(num_features):
-                    total, value, slopes = _ZERO, features[n, level, f], q[level, f]
-                    for k in range(num_hidden):
-                        total += first[level, f, k] * pre[k]
-                        first_grad[level, f, k] += value * pre[k] + slopes * scaled[k]
-                    features_grad[n, level, f] = total
+                _fill(hidden[k, start:end], h)
+                _fill(slope[k, start:end], s)
+                of_last, of_bias = _chain(h, s, g, last[k], pre[k], scaled[k])
+                last_grads[part, k] += of_last
+                bias_grads[part, k] += of_bias
+            _add_outer(pre, x, first_grads[part])
+            _add_outer(scaled, q, first_grads[part])
+            _product(transposed, pre, x)
+            for c in range(num_columns):
+                features_grad[c, start:end] = x[c, : end - start]
 
 
 class FusedSurface(torch.autograd.Function):
@@ -155,42 +220,36 @@ class FusedSurface(torch.autograd.Function):
         level_weights: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """`weight` [hidden, width] and `last` [1, hidden] as torch's linear layers hold them."""
-        positions = positions.detach().contiguous()
-        num_points, num_hidden, num_features = len(positions), len(weight), table.shape[1]
-        levels = (layout, half_resolutions(layout, np.dtype(np.float32)))
-        features, jacobian, by_feature = (
-            _levels_outermost(len(layout), num_points, num_features, *rest) for rest in ((), (3,), ())
-        )
-        grid_forward(positions.numpy(), table.detach().numpy(), *levels, features, jacobian, True)
-        scales = level_weights.detach().numpy().astype(np.float32)[:, None]
-        features *= scales
-        jacobian *= scales[..., None]
-        hidden, slope, distance, gradient = (
-            np.empty((num_points, *shape), np.float32) for shape in ((num_hidden,), (num_hidden,), (), (3,))
-        )
-        first = np.ascontiguousarray(weight.detach().numpy().T).reshape(len(layout), num_features, num_hidden)
-        layers = (first, bias.detach().numpy(), last.detach().numpy()[0])
-        _forward_layers(features, jacobian, *layers, by_feature, hidden, slope, distance, gradient)
-        ctx.arrays = (features, jacobian, hidden, slope, first, layers[2].copy())  # type: ignore[attr-defined]
-        ctx.grid = (positions.numpy(), table.shape, levels, scales, by_feature)  # type: ignore[attr-defined]
+        places, levels = _places(positions), _levels(layout, level_weights)
+        num_columns, num_points = len(layout) * table.shape[1], places.shape[1]
+        features, by_feature = (np.empty((num_columns, num_points), np.float32) for _ in range(2))
+        jacobian = np.empty((num_columns, 3, num_points), np.float32)
+        grid_forward(places, table.detach().numpy(), *levels, features, jacobian, True)
+        layers = _layers(weight, bias, last)
+        hidden, slope = (np.empty((len(layers[0]), num_points), np.float32) for _ in range(2))
+        distance, gradient = np.empty(num_points, np.float32), np.empty((num_points, 3), np.float32)
+        _forward_layers(features, jacobian, *layers, hidden, slope, by_feature, distance, gradient)
+        ctx.arrays = (features, jacobian, hidden, slope, layers[0], layers[3])  # type: ignore[attr-defined]
+        ctx.grid = (places, table.shape, levels, by_feature)  # type: ignore[attr-defined]
+        ctx.shape = weight.shape  # type: ignore[attr-defined]
         return torch.from_numpy(distance), torch.from_numpy(gradient)
 
     @staticmethod
     def backward(ctx, distance_grad: Tensor, gradient_grad: Tensor):  # type: ignore[no-untyped-def]
         """Gradients of table, weight, bias and last layer."""
-        first = ctx.arrays[4]
-        positions, table_shape, levels, scales, by_feature = ctx.grid
-        incoming = (distance_grad.contiguous().numpy(), gradient_grad.contiguous().numpy())
-        num_hidden = first.shape[-1]
-        features_grad = _levels_outermost(len(first), len(positions), first.shape[1])
-        sums = [np.zeros((_NUM_PARTS, *shape), np.float32) for shape in (first.shape, (num_hidden,), (num_hidden,))]
-        _backward_layers(*ctx.arrays, *incoming, features_grad, *sums)
+        places, table_shape, levels, by_feature = ctx.grid
+        num_hidden, width = ctx.shape
+        incoming = (distance_grad.contiguous().numpy(), gradient_grad.T.contiguous().numpy())
+        features_grad, first = np.empty_like(by_feature), ctx.arrays[4]
+        sums = [np.zeros((_NUM_PARTS, *shape), np.float32) for shape in (first.shape, first.shape[:1], first.shape[:1])]
+        *arrays, last = ctx.arrays
+        _backward_layers(*arrays, np.ascontiguousarray(first.T), last, *incoming, features_grad, *sums)
         table_grad = torch.zeros(table_shape)
-        features_grad *= scales
-        grid_backward_outer(positions, table_grad.numpy(), *levels, features_grad, by_feature * scales, incoming[1])
+        no_jacobian = np.empty((0, 3, 0), np.float32)
+        grid_backward(places, table_grad.numpy(), *levels, features_grad, no_jacobian, by_feature, incoming[1])
         first_grad, bias_grad, last_grad = (torch.from_numpy(part.sum(0)) for part in sums)
-        weight_grad = first_grad.view(-1, num_hidden).T.contiguous()
-        return table_grad, weight_grad, bias_grad, last_grad[None], None, None, None
+        of_layers = (first_grad[:num_hidden, :width], bias_grad[:num_hidden], last_grad[None, :num_hidden])
+        return table_grad, *of_layers, None, None, None
 
 
 def distance_alone(
@@ -198,18 +257,27 @@ def distance_alone(
     level_weights: Tensor,
 ) -> Tensor:  # fmt: skip
     """The distance of `FusedSurface`, for those who need no derivative of any kind."""
-    num_features, halves = table.shape[1], half_resolutions(layout, np.dtype(np.float32))
-    features = _levels_outermost(len(layout), len(positions), num_features)
-    places = positions.detach().contiguous().numpy()
-    # the Jacobian is not asked for, so that any array of its kind will do
-    grid_forward(places, table.detach().numpy(), layout, halves, features, features[..., None], False)
-    features *= level_weights.detach().numpy().astype(np.float32)[:, None]
-    first = np.ascontiguousarray(weight.detach().numpy().T).reshape(len(layout), num_features, len(weight))
-    distance = np.empty(len(positions), np.float32)
-    _distance_layers(features, first, bias.detach().numpy(), last.detach().numpy()[0], distance)
+    places = _places(positions)
+    features = np.empty((len(layout) * table.shape[1], places.shape[1]), np.float32)
+    no_matrix, no_jacobian = np.empty((0, 0), np.float32), np.empty((0, 3, 0), np.float32)
+    grid_forward(places, table.detach().numpy(), *_levels(layout, level_weights), features, no_jacobian, False)
+    distance = np.empty(places.shape[1], np.float32)
+    unused = (no_matrix, no_matrix, no_matrix, distance, no_matrix)
+    _forward_layers(features, no_jacobian, *_layers(weight, bias, last), *unused)
     return torch.from_numpy(distance)
 
 
-def _levels_outermost(num_levels: int, num_points: int, *rest: int) -> np.ndarray:
-    """Uninitialised float32 [points, levels, ...] that lies in memory level by level."""
-    return np.empty((num_levels, num_points, *rest), np.float32).swapaxes(0, 1)
+def _places(positions: Tensor) -> np.ndarray:
+    return positions.detach().T.contiguous().numpy()
+
+
+def _levels(layout: np.ndarray, level_weights: Tensor) -> tuple[np.ndarray, ...]:
+    return kernel_levels(layout, np.dtype(np.float32), level_weights.detach().numpy())
+
+
+def _layers(weight: Tensor, bias: Tensor, last: Tensor) -> tuple[np.ndarray, ...]:
+    """First layer, its transpose times the last layer, its bias and the last layer, filled up with zeros."""
+    num_hidden, width = (-size % _MULTIPLE for size in weight.shape)
+    first = np.pad(weight.detach().numpy(), ((0, num_hidden), (0, width)))
+    biases, lasts = (np.pad(row.detach().numpy().ravel(), (0, num_hidden)) for row in (bias, last))
+    return first, np.ascontiguousarray(first.T * lasts), biases, lasts
