@@ -95,6 +95,7 @@ def by_twins() -> Iterator[None]:
 def main(out: Path) -> None:
     from illuminerf.fields import surface_triton
 
+    assert surface_triton.why_not(torch.device("cpu"), 3, 4, 24) == ""
     found = {}
     # two programs have three tiles of points and more to share
     with (

@@ -116,6 +116,23 @@ def test_without_triton_the_twin_is_used_and_said_so(
     assert "pip install triton" in capsys.readouterr().err
 
 
+@needs_triton
+def test_what_keeps_kernels_from_running_is_said_in_a_line() -> None:
+    from triton.runtime.errors import OutOfResources
+
+    from illuminerf.fields.hash_grid_triton import trouble_with
+
+    def fails(error: Exception) -> tuple[torch.Tensor, ...]:
+        raise error
+
+    assert "shared memory" in trouble_with(lambda: fails(OutOfResources(200, 100, "shared memory")))
+    assert trouble_with(lambda: fails(RuntimeError("no driver\nat all"))) == "no driver"
+    assert trouble_with(lambda: fails(OSError())) == "OSError"
+    assert trouble_with(lambda: (torch.zeros(2, requires_grad=True),)) == ""
+    with pytest.raises(TypeError):  # a mistake of ours is no reason to go on
+        trouble_with(lambda: fails(TypeError()))
+
+
 _COMPILE = """
 import itertools, sys
 import illuminerf

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from illuminerf.fields import hash_grid, surface_kernel
+from illuminerf.fields import surface as surface_module
 from illuminerf.fields.hash_grid import HashGridConfig
 from illuminerf.fields.surface import SurfaceConfig, SurfaceField, SurfacePoint
 from tests.fields.surface_triton_cases import CASES, Case, answers, by_twins
@@ -86,10 +87,12 @@ class _OnGpu(Tensor):
 
 
 @needs_triton
-def test_which_kernels_take_a_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_which_kernels_take_a_surface(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     from illuminerf.fields import surface_triton
 
     monkeypatch.setattr(hash_grid, "_gpu_kernel", lambda device: object())
+    monkeypatch.setattr(surface_triton, "trouble_with", lambda outputs: "")
+    monkeypatch.setattr(surface_module, "_gpu_kernels", surface_module._gpu_kernels.__wrapped__)
     grid = HashGridConfig(2, 4, 8, 3, 12)
     surface, positions = SurfaceField(SurfaceConfig(grid, 24, grid, 4)), torch.zeros(5, 3)
     there = positions.as_subclass(_OnGpu)
@@ -100,6 +103,11 @@ def test_which_kernels_take_a_surface(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [len(part) for part in surface(torch.zeros(0, 3))] == [0, 0]
     wide = SurfaceField(SurfaceConfig(grid, surface_triton.WIDEST + 1, grid, 4))
     assert wide._kernels(there) is None and wide._kernels(positions) is surface_kernel
+    assert "layers of 8 to 65 are wider than 64" in capsys.readouterr().err
+    monkeypatch.setattr(surface_triton, "trouble_with", lambda outputs: "out of shared memory")
+    assert surface._kernels(there) is None
+    assert "the surface runs slower than it could on cpu" in (said := capsys.readouterr().err)
+    assert "out of shared memory" in said
     # and all points where Triton does not work
     monkeypatch.setattr(hash_grid, "_gpu_kernel", lambda device: None)
     assert surface._kernels(there) is None

@@ -20,6 +20,7 @@ by atomics which the L2 carries out. They add in any order, so two runs differ b
 import contextlib
 import functools
 import subprocess
+from collections.abc import Callable
 from typing import no_type_check
 
 import numpy as np
@@ -28,6 +29,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
+from triton.errors import TritonError
 
 POINTS_PER_PROGRAM = 128
 # multiply and add stay two roundings as in the twin: fused, points on the border of two cells would change sides
@@ -216,10 +218,16 @@ class TritonInterpolation(torch.autograd.Function):
 
 def why_not(device: torch.device) -> str:
     """What keeps the kernels from running on this device (Triton needs a C compiler at run time), or ""."""
-    table, positions = torch.zeros(8, 2, device=device), torch.zeros(1, 3, device=device)
+    table, positions = torch.zeros(8, 2, device=device, requires_grad=True), torch.zeros(1, 3, device=device)
+    return trouble_with(lambda: TritonInterpolation.apply(table, positions, np.array([[1, 8, 0]]), True))
+
+
+def trouble_with(outputs: Callable[[], tuple[Tensor, ...]]) -> str:
+    """What keeps outputs, or their gradients, from being computed by kernels, in a line; or ""."""
     try:
-        TritonInterpolation.apply(table, positions, np.array([[1, 8, 0]]), True)
-    except (RuntimeError, OSError, ImportError, subprocess.CalledProcessError) as error:
+        with torch.enable_grad():
+            sum(output.sum() for output in outputs()).backward()  # type: ignore[union-attr]
+    except (TritonError, RuntimeError, OSError, ImportError, subprocess.CalledProcessError) as error:
         return str(error).splitlines()[0] if str(error) else type(error).__name__
     return ""
 

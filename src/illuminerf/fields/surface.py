@@ -1,5 +1,6 @@
 """The surface: a signed distance with its normals, and the predicted normals."""
 
+import functools
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from illuminerf.fields.bounds import OccupiedCells
 from illuminerf.fields.hash_grid import HashGrid, HashGridConfig
 from illuminerf.fields.volume_rendering import optical_depth
 from illuminerf.workflow.errors import UserError
+from illuminerf.workflow.progress import say
 
 _SHARPNESS = 100.0
 
@@ -126,9 +128,8 @@ class SurfaceField(nn.Module):
             return surface_kernel
         if not self.grid.runs_in_triton(positions):
             return None
-        from illuminerf.fields import surface_triton
-
-        return surface_triton if max(self.hidden.weight.shape) <= surface_triton.WIDEST else None
+        grid = self.config.grid
+        return _gpu_kernels(positions.device, grid.num_levels, grid.num_features, self.config.hidden_width)
 
     def _kernel_inputs(self, positions: Tensor, level_weights: Tensor | None) -> tuple[Any, ...]:
         table, levels = self.grid.table, level_weights
@@ -155,6 +156,18 @@ class SurfaceField(nn.Module):
         widths = (edges[:, 1:] - edges[:, :-1]).clamp_min(1e-7)
         before, after = signed_distance[:, :-1], signed_distance[:, 1:]
         return optical_depth(0.5 * (before + after), (after - before) / widths, widths, self.beta)
+
+
+@functools.cache
+def _gpu_kernels(device: torch.device, num_levels: int, num_features: int, num_hidden: int) -> Any:
+    """`surface_triton`, or None where it cannot run; then the hash grid's kernels and torch do."""
+    from illuminerf.fields import surface_triton
+
+    reason = surface_triton.why_not(device, num_levels, num_features, num_hidden)
+    if not reason:
+        return surface_triton
+    say(f"the surface runs slower than it could on {device}, without its own kernels: {reason}")
+    return None
 
 
 class _SoftplusWithSlope(torch.autograd.Function):

@@ -37,7 +37,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from illuminerf.fields.hash_grid_triton import OPTIONS, POINTS_PER_PROGRAM, current, level_rows
+from illuminerf.fields.hash_grid_triton import OPTIONS, POINTS_PER_PROGRAM, current, level_rows, trouble_with
 from illuminerf.fields.surface_grid_triton import gather, scatter, slopes
 
 WIDEST = 64
@@ -218,6 +218,17 @@ def distance_alone(
     with current(table):
         _gathered(positions, table, levels, features)
         return _distances(features, (weight * columns, bias, last), None)
+
+
+def why_not(device: torch.device, num_levels: int, num_features: int, num_hidden: int) -> str:
+    """What keeps the kernels from running on this device for a surface of these sizes, or ""."""
+    shapes = ((8 * num_levels, num_features), (num_hidden, num_levels * num_features), (num_hidden,), (1, num_hidden))
+    if max(shapes[1]) > WIDEST:
+        return f"layers of {shapes[1][1]} to {shapes[1][0]} are wider than {WIDEST}"
+    parameters = [torch.zeros(shape, device=device, requires_grad=True) for shape in shapes]
+    layout = np.array([[1, 8, 8 * level] for level in range(num_levels)])
+    others = (torch.zeros(1, 3, device=device), layout, torch.ones(num_levels, device=device))
+    return trouble_with(lambda: FusedSurface.apply(*parameters, *others))
 
 
 def _placed(
