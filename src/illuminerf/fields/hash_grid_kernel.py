@@ -272,4 +272,4 @@ def kernel_levels(
     In the positions' type: numba would promote float32 beside an integer.
     """
     known = np.ones(len(layout)) if weights is None else weights
-    return layout, np.asarray(layout[:, 0] / 2, dtype), np.asarray(known, dtype)
+    return layout, np.array(layout[:, 0] / 2, dtype), np.array(known, dtype)
