@@ -69,15 +69,16 @@ class _Window:
         while True:
             try:
                 found, end = decoder.raw_decode(self.text, self.position)
-                # a number cut off by the window's end is a number too: -1 of -1.5
-                if end < len(self.text) and self.text[end] in _AFTER_VALUE:
-                    self.position = end
-                    return found
-                reason = ValueError("a value without an end")
-            except ValueError as error:
-                reason = error
+            except ValueError:  # kept by no name: it holds the text, and would hold itself through this frame
+                if not self.refill():
+                    raise
+                continue
+            # a number cut off by the window's end is a number too: -1 of -1.5
+            if end < len(self.text) and self.text[end] in _AFTER_VALUE:
+                self.position = end
+                return found
             if not self.refill():
-                raise reason
+                raise ValueError("a value without an end")
 
 
 def _entries(file: TextIOWrapper) -> Iterator[tuple[str, Any]]:

@@ -19,7 +19,6 @@ by atomics which the L2 carries out. They add in any order, so two runs differ b
 
 import contextlib
 import functools
-import subprocess
 from collections.abc import Callable
 from typing import no_type_check
 
@@ -29,7 +28,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
-from triton.errors import TritonError
 
 POINTS_PER_PROGRAM = 128
 # multiply and add stay two roundings as in the twin: fused, points on the border of two cells would change sides
@@ -74,7 +72,8 @@ def own_points(positions, table, levels, num_points, block: tl.constexpr):
     exists, row = point < num_points, point.to(tl.int64)
     half = resolution.to(table.dtype.element_ty) * 0.5
     x, y, z, fx, fy, fz = _cells(positions, row, exists, resolution, half)
-    return level, row, exists, half, (x, y, z, resolution, offset, hash_mask, is_dense), (fx, fy, fz)
+    cell = (x, y, z, resolution, offset, hash_mask, is_dense)
+    return level, row, exists, half, cell, fx, fy, fz
 
 
 @triton.jit
@@ -114,7 +113,7 @@ def _forward(
     with_jacobian: tl.constexpr,
     block: tl.constexpr,
 ):
-    level, row, exists, half, cell, (fx, fy, fz) = own_points(positions, table, levels, num_points, block)
+    level, row, exists, half, cell, fx, fy, fz = own_points(positions, table, levels, num_points, block)
     feature = tl.arange(0, padded)
     kept = exists[:, None] & (feature < num_features)[None, :]
     value = tl.zeros((block, padded), table.dtype.element_ty)
@@ -156,7 +155,7 @@ def _backward(
     with_jacobian: tl.constexpr,
     block: tl.constexpr,
 ):
-    level, row, exists, half, cell, (fx, fy, fz) = own_points(positions, table_grad, levels, num_points, block)
+    level, row, exists, half, cell, fx, fy, fz = own_points(positions, table_grad, levels, num_points, block)
     feature = tl.arange(0, padded)
     kept = exists[:, None] & (feature < num_features)[None, :]
     column = (level * num_features + feature)[None, :]
@@ -227,8 +226,8 @@ def trouble_with(outputs: Callable[[], tuple[Tensor, ...]]) -> str:
     try:
         with torch.enable_grad():
             sum(output.sum() for output in outputs()).backward()  # type: ignore[union-attr]
-    except (TritonError, RuntimeError, OSError, ImportError, subprocess.CalledProcessError) as error:
-        return str(error).splitlines()[0] if str(error) else type(error).__name__
+    except Exception as error:  # whatever it is, here and in Triton's own code: the readable twin runs everywhere
+        return f"{type(error).__name__}: {error}".splitlines()[0]
     return ""
 
 

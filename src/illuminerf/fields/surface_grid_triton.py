@@ -44,7 +44,7 @@ def gather(
     is_slope: tl.constexpr,
     block: tl.constexpr,
 ):
-    level, row, exists, half, cell, (fx, fy, fz) = own_points(positions, table, levels, num_points, block)
+    level, row, exists, half, cell, fx, fy, fz = own_points(positions, table, levels, num_points, block)
     if is_slope:
         gx, gy, gz = _direction(directions, row, exists, half)
     feature = tl.arange(0, padded)[None, :]
@@ -75,7 +75,7 @@ def slopes(
     padded: tl.constexpr,
     block: tl.constexpr,
 ):
-    level, row, exists, half, cell, (fx, fy, fz) = own_points(positions, table, levels, num_points, block)
+    level, row, exists, half, cell, fx, fy, fz = own_points(positions, table, levels, num_points, block)
     feature = tl.arange(0, padded)[None, :]
     kept = exists[:, None] & (feature < num_features)
     first = level.to(tl.int64) * num_points
@@ -110,7 +110,7 @@ def scatter(
     padded: tl.constexpr,
     block: tl.constexpr,
 ):
-    level, row, exists, half, cell, (fx, fy, fz) = own_points(positions, table_grad, levels, num_points, block)
+    level, row, exists, half, cell, fx, fy, fz = own_points(positions, table_grad, levels, num_points, block)
     gx, gy, gz = _direction(directions, row, exists, half)
     feature = tl.arange(0, padded)[None, :]
     kept = exists[:, None] & (feature < num_features)
