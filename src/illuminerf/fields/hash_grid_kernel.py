@@ -2,9 +2,9 @@
 
 Everything lies with the points last, and is computed by blocks of points that stay in the first-level cache: where the
 points lie, what the table holds there, and what comes of it are loops of their own, so that only reading and writing
-the table is not vector arithmetic. These loops see whole arrays, or parts that were cut out before: of
-`array[start + n]` LLVM cannot tell how far it reaches, so that whether a loop runs as vectors, and with it the
-rounding, would depend on where arrays happen to lie.
+the table is not vector arithmetic. These loops see whole arrays, or parts that were cut out before: with
+`array[start + n]` in them, rounding depended on where arrays happened to lie (LLVM, it seems, then asks at run time
+whether they overlap, and leaves out the vectors).
 
 Forward runs in parallel over levels and parts of the points: a thread stays with one level, whose table stays in its
 cache. Backward runs in parallel over levels: levels share no table entries, so no two threads write to the same place,
